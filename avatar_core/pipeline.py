@@ -217,7 +217,7 @@ def build(
 
 
 def _timed(vademecum: Vademecum, progress: Progress) -> Vademecum:
-    """The vademecum with the times of its curve, or a notice why they were not measured."""
+    """Return the vademecum with the times of its curve, or a notice why they were not measured."""
     certificate = vademecum.certificate
     assert certificate is not None and certificate.curve is not None
     try:
@@ -228,7 +228,7 @@ def _timed(vademecum: Vademecum, progress: Progress) -> Vademecum:
 
 
 def _with_large(vademecum: Vademecum, options: OrganOptions, progress: Progress) -> Vademecum:
-    """The vademecum with the load's magnitude as a coordinate, certified."""
+    """Return the vademecum with the load's magnitude as a coordinate, certified."""
     assert options.large is not None
     problem = hyperelastic_problem(vademecum, options.large)
     vademecum = with_large_deformation(
@@ -261,7 +261,7 @@ def _with_large(vademecum: Vademecum, options: OrganOptions, progress: Progress)
 
 
 def _problem(surface: SurfaceMesh, options: OrganOptions) -> tuple[Elasticity, Regions]:
-    """The elastic problem of an organ, and its regions.
+    """Return the elastic problem of an organ, and its regions.
 
     Raises MaterialError if the opened resection leaves a part loose.
     """
@@ -280,7 +280,7 @@ def _problem(surface: SurfaceMesh, options: OrganOptions) -> tuple[Elasticity, R
 
 
 def _held(mesh: TetMesh, options: OrganOptions) -> tuple[Regions, tuple[Support, ...]]:
-    """Clamp, accessible region and supports."""
+    """Return the clamp, accessible region and supports."""
     if options.supports:
         return held_by(mesh, options.supports, options.groups)
     if options.groups:
@@ -295,7 +295,7 @@ def _elasticity(
     options: OrganOptions,
     resection: Resection | None = None,
 ) -> Elasticity:
-    """The elastic problem, on one element that serves the whole range of Poisson's ratio."""
+    """Return the elastic problem, on one element that serves the whole range of Poisson's ratio."""
     ratios = [c.high for c in options.coordinates if c.name == "poisson"]
     stiffest = replace(options.material, poisson_ratio=max(ratios)) if ratios else options.material
     inclusion = None
@@ -311,7 +311,7 @@ def _elasticity(
 
 @lru_cache(maxsize=1)  # a command says them before it builds
 def notices_of(surface: SurfaceMesh, options: OrganOptions) -> tuple[str, ...]:
-    """Notices before a build, one line each: what was read, and what is doubtful.
+    """Return the notices before a build, one line each: what was read, and what is doubtful.
 
     Raises SurfaceError if less than half of the tumour lies in the organ.
     """

@@ -21,7 +21,11 @@ class ResponseKind:
     """How a response was computed.
 
     material, element, patch_radius [m] : of the finite element solutions
-    rank : number of modes
+
+    Attributes
+    ----------
+    rank : int
+        Number of modes.
     """
 
     material: Material
@@ -51,10 +55,16 @@ class Response(CompactResponse):
 class Origin:
     """The surface from which an anatomy was made.
 
-    sha256 : of its file; empty for a generated surface
-    unit, axes : of the file
-    n_vertices : of the surface
-    notices : what was changed on reading, one line each
+    Attributes
+    ----------
+    sha256 : str
+        sha256 of its file; empty for a generated surface.
+    unit, axes : str
+        Unit and axes of the file.
+    n_vertices : int
+        n vertices of the surface.
+    notices : tuple[str, ...]
+        What was changed on reading, one line each.
     """
 
     sha256: str
@@ -71,15 +81,24 @@ class Anatomy:
     Its level set and its response are read when they are used; see
     :class:`avatar_core.atlas.model.Atlas`.
 
-    name : unique in the atlas
-    key : hash of the surface and its reading
+    Attributes
+    ----------
+    name : str
+        Unique in the atlas.
+    key : str
+        Hash of the surface and its reading.
     origin : Origin
-    volume : [m3]
-    alignment : SimilarityTransform from the template to the organ
-    registered : ndarray, shape (n_template_vertices, 3), the template registered to the organ [m]
+    volume : float
+        Volume [m3].
+    alignment : SimilarityTransform
+        SimilarityTransform from the template to the organ.
+    registered : ndarray, shape (n_template_vertices, 3)
+        The template registered to the organ [m].
     quality : RegistrationQuality
-    converged : whether the registration converged
-    response : ResponseKind; None if there is no response
+    converged : bool
+        Whether the registration converged.
+    response : ResponseKind or None
+        ResponseKind; None if there is no response.
     """
 
     name: str
@@ -97,9 +116,13 @@ class Anatomy:
 class WholeAnatomy:
     """An anatomy with everything that its folder holds.
 
+    Attributes
+    ----------
     shape : Anatomy
-    distances : ndarray, shape (n_points,), signed distance on the atlas's box [m]
-    response : Response; None if it was not computed
+    distances : ndarray, shape (n_points,)
+        Signed distance on the atlas's box [m].
+    response : Response or None
+        Response; None if it was not computed.
     """
 
     shape: Anatomy
@@ -111,7 +134,10 @@ class WholeAnatomy:
 class Duplicate:
     """A member that has the shape of an earlier one; it has no weight in any barycenter.
 
-    name, of : names of the member and of the earlier one
+    Attributes
+    ----------
+    name, of : str
+        Names of the member and of the earlier one.
     """
 
     name: str
@@ -122,7 +148,7 @@ class Duplicate:
 
 
 def free_name(name: str, taken: Collection[str]) -> str:
-    """The name, with a number appended if it is taken."""
+    """Return the name, with a number appended if it is taken."""
     if name not in taken:
         return name
     number = 2

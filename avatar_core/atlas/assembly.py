@@ -97,7 +97,7 @@ def _field(
 def _with_gram_of(
     load: np.ndarray, near: LocalBlocks, surface: LoadSurface, reach: float
 ) -> LocalBlocks:
-    """Blocks and the tapered compliance of modes that are left out, Y Y^T."""
+    """Return the blocks and the tapered compliance of modes that are left out, Y Y^T."""
     distance = near.distances(surface.centers)
     zero = replace(near, block=np.zeros_like(near.block))
     left = remainder(zero, load, taper(distance / reach))
@@ -113,7 +113,7 @@ def _sorted_by_norm(response: CompactResponse, mesh: TetMesh) -> SeparatedField:
 
 
 def provenance(problem: PatientProblem) -> Provenance:
-    """The patient's surface, and the template from which clamp, access and supports are."""
+    """Return the patient's surface, and the template from which clamp, access and supports are."""
     surface = problem.surface
     held = " ".join(f"{s.name}={s.stiffness:g}" for s in problem.elasticity.supports)
     parameters = {"template": problem.registration.template.name} | (

@@ -28,17 +28,29 @@ def _unknown(sha256: str) -> Registration | None:
 class PatientBase:
     """Anatomies with their responses, all on one template.
 
-    template, loads : Template and the load positions of its mesh and regions
-    material : Material of all responses
-    names : of the anatomies
-    vertices : n arrays of shape (n_template, 3) [m], the template registered to each anatomy
-    responses : one CompactResponse per anatomy; may be a lazy sequence
-    copies : numbers of anatomies that repeat an earlier one, and get no weight
-    distances : signed distances of each anatomy on a common grid, n arrays of shape (n_grid,),
-        or None; may be a lazy sequence
-    distance_of : signed distances of a new surface on the same grid, or None
-    rule : RegistrationRule of all registrations
-    registration_of : registration of the anatomy with a hash of its file, or None
+    Attributes
+    ----------
+    template, loads : Template
+        Template and the load positions of its mesh and regions.
+    material : Material
+        Material of all responses.
+    names : tuple[str, ...]
+        Names of the anatomies.
+    vertices : Vectors
+        n arrays of shape (n_template, 3) [m], the template registered to each anatomy.
+    responses : Sequence[CompactResponse]
+        One CompactResponse per anatomy; may be a lazy sequence.
+    copies : tuple[int, ...]
+        Numbers of anatomies that repeat an earlier one, and get no weight.
+    distances : Sequence[ndarray] or None
+        Signed distances of each anatomy on a common grid, n arrays of shape (n_grid,), or None; may
+        be a lazy sequence.
+    distance_of : Callable[[SurfaceMesh, Registration], ndarray] or None
+        Signed distances of a new surface on the same grid, or None.
+    rule : RegistrationRule
+        RegistrationRule of all registrations.
+    registration_of : Callable[[str], Registration or None]
+        Registration of the anatomy with a hash of its file, or None.
     """
 
     template: Template
@@ -55,7 +67,7 @@ class PatientBase:
 
 
 def base_of(atlas: Atlas) -> PatientBase:
-    """The anatomies of an atlas that have a response; each is read when it is used.
+    """Return the anatomies of an atlas that have a response; each is read when it is used.
 
     Raises
     ------
@@ -107,7 +119,7 @@ def leave_one_out(base: PatientBase, name: str, same: Collection[Collection[str]
 
 
 def numbers_of(base: PatientBase, names: Collection[str]) -> tuple[int, ...]:
-    """Numbers of some anatomies.
+    """Return the numbers of some anatomies.
 
     Raises PatientError for a name that the base does not have.
     """

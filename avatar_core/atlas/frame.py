@@ -22,9 +22,14 @@ SLACK = 0.018  # on every side, since organs are aligned by shape and not by the
 class Frame:
     """Template, grid and rule that all anatomies of an atlas share; fixed when it is created.
 
-    template : Template, registered to every anatomy
-    box : GridBox around the template, at whose points signed distances are taken
-    rule : RegistrationRule of all registrations
+    Attributes
+    ----------
+    template : Template
+        Registered to every anatomy.
+    box : GridBox
+        GridBox around the template, at whose points signed distances are taken.
+    rule : RegistrationRule
+        RegistrationRule of all registrations.
     """
 
     template: Template
@@ -37,9 +42,12 @@ class Frame:
         return math.prod(self.box.shape)
 
     def place(self, surface: SurfaceMesh, alignment: SimilarityTransform) -> SurfaceMesh:
-        """The organ moved to the template by rotation and translation; its size is kept.
+        """Return the organ moved to the template by rotation and translation; its size is kept.
 
-        alignment : of its registration, from the template to the organ
+        Parameters
+        ----------
+        alignment : SimilarityTransform
+            Alignment of its registration, from the template to the organ.
         """
         center = self.template.mesh.centroid
         moved = (surface.vertices - alignment(center)) @ alignment.rotation + center

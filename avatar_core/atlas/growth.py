@@ -75,10 +75,16 @@ Source = SurfaceFile | SurfaceMesh
 class AtlasOptions:
     """Settings that are fixed when an atlas is created.
 
-    template_vertices : approximate number, of the mesh of the built-in liver, the template
-    largest : size of the largest organ that fits into the box, along x, y, z [m]
-    spacing : of the grid in the box [m]
-    rule : RegistrationRule of all registrations
+    Attributes
+    ----------
+    template_vertices : int
+        Approximate number, of the mesh of the built-in liver, the template.
+    largest : tuple[float, float, float]
+        Size of the largest organ that fits into the box, along x, y, z [m].
+    spacing : float
+        Spacing of the grid in the box [m].
+    rule : RegistrationRule
+        RegistrationRule of all registrations.
     """
 
     template_vertices: int = 2500
@@ -99,12 +105,19 @@ class Skipped:
 class Growth:
     """Result of a build.
 
-    atlas : with the new members
-    added : names of the new members
-    known : names of members whose surfaces were given again; nothing was done for them
-    skipped : surfaces that were not added
-    notices : new members that are duplicates, whose registration did not converge, or whose
-        surface was changed on reading, one line each
+    Attributes
+    ----------
+    atlas : Atlas
+        Atlas with the new members.
+    added : tuple[str, ...]
+        Names of the new members.
+    known : tuple[str, ...]
+        Names of members whose surfaces were given again; nothing was done for them.
+    skipped : tuple[Skipped, ...]
+        Surfaces that were not added.
+    notices : tuple[str, ...]
+        New members that are duplicates, whose registration did not converge, or whose surface was
+        changed on reading, one line each.
     """
 
     atlas: Atlas
@@ -115,7 +128,7 @@ class Growth:
 
 
 def new_frame(template: Template, options: AtlasOptions | None = None) -> Frame:
-    """The frame of an atlas.
+    """Return the frame of an atlas.
 
     Raises AtlasError if the box or the spacing is unreasonable.
     """
@@ -226,7 +239,7 @@ def _lock(handle: int, folder: Path) -> None:
 
 
 def _begun(folder: Path, options: AtlasOptions, template: Template | None) -> Frame:
-    """The frame of a new atlas, or that of a build that was stopped.
+    """Return the frame of a new atlas, or that of a build that was stopped.
 
     Meshing a template again would give another mesh: it is made once and kept.
     """
@@ -316,12 +329,12 @@ def _names(sources: Sequence[Source], keys: Sequence[str | None], there: Atlas) 
 
 
 def _folder_name(name: str) -> str:
-    """A name that a folder can have."""
+    """Return a name that a folder can have."""
     return name.replace("/", "_").lstrip(".") or "anatomy"
 
 
 def _growth(there: Atlas, results: Mapping[int, Anatomy | Skipped], names: list[str]) -> Growth:
-    """Result with members in the order of the surfaces, whatever the order of completion."""
+    """Return result with members in the order of the surfaces, whatever the order of completion."""
     ordered = [results[number] for number in sorted(results)]
     new = [one for one in ordered if isinstance(one, Anatomy)]
     members = sorted((*there.anatomies, *new), key=lambda one: one.name)

@@ -29,7 +29,14 @@ MOST_NEIGHBORS = 64
 class Lazy(Sequence[Item], Generic[Item]):
     """A sequence whose items are made when they are asked for; the last used ones are kept.
 
-    make : item of a number; n : length; kept : how many items are kept
+    Parameters
+    ----------
+    make : Callable[[int], Item]
+        Item of a number.
+    n : int
+        Length.
+    kept : int
+        How many items are kept.
     """
 
     def __init__(self, make: Callable[[int], Item], n: int, kept: int = 0) -> None:
@@ -110,7 +117,7 @@ class Atlas:
 
 
 def centred(vertices: Vectors) -> Lazy[FloatArray]:
-    """Vertices, each of shape (n, 3), without their translation, as vectors (3 n,) [m]."""
+    """Return vertices, each of shape (n, 3), without their translation, as vectors (3 n,) [m]."""
 
     def vector(i: int) -> FloatArray:
         exact = np.asarray(vertices[i], dtype=np.float64)
@@ -120,7 +127,7 @@ def centred(vertices: Vectors) -> Lazy[FloatArray]:
 
 
 def first_equal(vectors: Sequence[FloatArray]) -> IntArray:
-    """Number of the first vector equal to each, mostly its own, shape (n,).
+    """Return the number of the first vector equal to each, mostly its own, shape (n,).
 
     Equal vectors have equal lengths: those next to each other in the order of length are compared.
     """

@@ -192,7 +192,7 @@ def posed_patient(
     progress: Progress = silent,
     clock: dict[str, float] | None = None,
 ) -> tuple[PatientProblem, Barycenter]:
-    """A patient registered and meshed, with clamp and access, before anything is solved.
+    """Return a patient registered and meshed, with clamp and access, before anything is solved.
 
     Parameters and errors as of :func:`patient_vademecum`.
     """
@@ -352,7 +352,7 @@ def vademecum_of_reduced(
 def solved(
     problem: PatientProblem, options: PatientOptions, progress: Progress = silent
 ) -> Vademecum:
-    """Full finite elements for every load position."""
+    """Return the full finite elements for every load position."""
     return build_vademecum(
         problem.surface.name,
         problem.elasticity,

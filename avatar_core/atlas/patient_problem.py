@@ -27,9 +27,16 @@ MISSED = 3e-3  # distance from a mesh, of parts that it does not reach [m]
 class PatientProblem:
     """A patient's own mesh, with clamp and load positions transferred from the template.
 
-    surface : of the patient; registration : of the template to it
-    mesh, regions, loads, elasticity : the patient's
-    notices : what is doubtful of the organ, one line each
+    Attributes
+    ----------
+    surface : SurfaceMesh
+        Surface of the patient.
+    registration : Registration
+        Registration of the template to it.
+    mesh, regions, loads, elasticity : TetMesh
+        The patient's.
+    notices : tuple[str, ...]
+        What is doubtful of the organ, one line each.
     """
 
     surface: SurfaceMesh
@@ -43,7 +50,8 @@ class PatientProblem:
     @property
     def outline(self) -> SurfaceMesh | None:
         """What tools touch: the surface, or None for the boundary of a registered template, which
-        lies beside it."""
+        lies beside it.
+        """
         return None if self.mesh is self.registration.mesh else self.surface
 
 
@@ -57,9 +65,13 @@ def patient_problem(
 ) -> PatientProblem:
     """Transfer clamp or supports, accessible region and patch radius to a patient's mesh.
 
-    groups : points of the clamp, the accessible region and supports, in place of the template's
-        (:mod:`avatar_core.geometry.groups`); without supports, of both regions
-    supports : that hold the organ instead of the clamp
+    Parameters
+    ----------
+    groups : Mapping[str, ndarray] or None
+        Points of the clamp, the accessible region and supports, in place of the template's
+        (:mod:`avatar_core.geometry.groups`); without supports, of both regions.
+    supports : Sequence[SupportOption]
+        Supports that hold the organ instead of the clamp.
 
     Raises
     ------
@@ -91,7 +103,10 @@ def template_problem(
 ) -> PatientProblem:
     """A patient on the registered template: no mesh is made, and responses combine node by node.
 
-    member : an anatomy of the base that the patient is, on whose own template its response is
+    Parameters
+    ----------
+    member : int or None
+        An anatomy of the base that the patient is, on whose own template its response is.
     """
     template, own = base.template, registration
     if member is not None:
@@ -104,7 +119,7 @@ def template_problem(
 
 
 def distances_to_mesh(problem: PatientProblem) -> np.ndarray:
-    """Distances of the vertices of the patient's surface from the mesh, shape (n,) [m]."""
+    """Return distances of the vertices of the patient's surface from the mesh, shape (n,) [m]."""
     points = problem.surface.vertices
     closest, _, _ = closest_points(problem.mesh.vertices, problem.mesh.boundary_faces, points)
     return np.asarray(np.linalg.norm(points - closest, axis=1))
@@ -126,7 +141,7 @@ def missed_part(problem: PatientProblem) -> tuple[np.ndarray, np.ndarray]:
 
 
 def said_of_missed(problem: PatientProblem) -> str:
-    """Line that says how far a registered template is off the patient."""
+    """Return the line that says how far a registered template is off the patient."""
     far, (x, y, z) = missed(problem)
     return (
         f"interpolated on a registered template, which is up to {1e3 * far:.1f} mm off the surface "

@@ -16,8 +16,12 @@ from avatar_core.shapes.registration import Registration
 class ResponseSolver:
     """Computes the response of an anatomy; picklable.
 
-    material : of all anatomies
-    rank : number of modes that are kept
+    Attributes
+    ----------
+    material : Material
+        Material of all anatomies.
+    rank : int
+        Number of modes that are kept.
     """
 
     material: Material = field(default_factory=Material)

@@ -126,12 +126,12 @@ def load_atlas(path: str | Path) -> Atlas:
 
 
 def member_names(folder: Path) -> list[str]:
-    """Names of the members, sorted; nothing is read."""
+    """Return the names of the members, sorted; nothing is read."""
     return sorted(file.parent.name for file in folder.glob(f"*/{SHAPE}"))
 
 
 def n_bytes(folder: Path) -> int:
-    """Size of all files of an atlas [bytes]."""
+    """Return the size of all files of an atlas [bytes]."""
     return sum(file.stat().st_size for file in (*folder.glob("*.h5"), *folder.glob("*/*.h5")))
 
 
@@ -152,7 +152,7 @@ def save_frame(folder: Path, frame: Frame, made_from: str) -> None:
 
 
 def load_frame(folder: Path) -> tuple[Frame, str]:
-    """The frame of an atlas, and the hash of what it was made from.
+    """Return the frame of an atlas, and the hash of what it was made from.
 
     Raises StorageError unless the folder is an atlas of this version.
     """
@@ -304,7 +304,7 @@ def _write(file: Path, arrays: Arrays, about: Any) -> None:
 
 
 def _read(file: Path, remedy: str = _AGAIN) -> tuple[Arrays, Any]:
-    """Arrays and JSON of a file of an atlas, verified; StorageError with the remedy."""
+    """Return the arrays and JSON of a file of an atlas, verified; StorageError with the remedy."""
     kind, held_keys = _FORMATS[file.name], ("format", "schema", "about")
 
     def choose(held: dict[str, str], origin: str) -> dict[str, str]:

@@ -56,12 +56,16 @@ def patient_weights(
     n_neighbors: int | None = None,
     leave_out: Collection[int] = (),
 ) -> Barycenter:
-    """Weights of the anatomies of a base for a patient.
+    """Return the weights of the anatomies of a base for a patient.
 
-    weighting : "kriging", see :func:`kriging`, and "lle-template", Eq. 15, both on the centred
-        registered vertices; "lle-grid", Eq. 15 on the distances at the common grid; "lle-paper",
-        the same as in the paper, with ten neighbours and almost no ridge
-    n_neighbors : k; None for the 64 nearest, 40 with "lle-template" and 10 with "lle-paper"
+    Parameters
+    ----------
+    weighting : Weighting
+        "kriging", see :func:`kriging`, and "lle-template", Eq. 15, both on the centred registered
+        vertices; "lle-grid", Eq. 15 on the distances at the common grid; "lle-paper", the same as
+        in the paper, with ten neighbours and almost no ridge.
+    n_neighbors : int or None
+        k; None for the 64 nearest, 40 with "lle-template" and 10 with "lle-paper".
 
     Raises
     ------
@@ -96,7 +100,7 @@ def kriging(
     n_neighbors: int,
     leave_out: Collection[int] = (),
 ) -> Barycenter:
-    """Weights of ordinary kriging with the power variogram gamma(h) = h^1.8 (Matheron 1963).
+    """Return weights of ordinary kriging with the power variogram gamma(h) = h^1.8 (Matheron 1963).
 
         [ -D  1 ] [ w ]   [ -d ]
         [ 1^T 0 ] [ m ] = [  1 ],    D_ij = |X_i - X_j|^1.8, d_i = |X_i - x|^1.8
@@ -106,8 +110,10 @@ def kriging(
 
     Parameters
     ----------
-    vectors : ndarray, shape (n, D); point : ndarray, shape (D,)
-    n_neighbors : number of nearest anatomies that get weights
+    vectors : ndarray, shape (n, D)
+    point : ndarray, shape (D,)
+    n_neighbors : int
+        Number of nearest anatomies that get weights.
     """
     found = barycenter(vectors, point, n_neighbors, leave_out=leave_out)
     if found.member is not None:
@@ -137,7 +143,10 @@ def combine(
     The leading part of C is found by two subspace iterations on random columns (Halko, Martinsson &
     Tropp, SIAM Review 53, 2011), which use every response three times and never form C.
 
-    rank : maximum number of modes
+    Parameters
+    ----------
+    rank : int
+        Maximum number of modes.
     """
     if weights.member is not None:
         return responses[weights.member]
@@ -157,7 +166,7 @@ def combine(
 def leading_loads(
     terms: Sequence[tuple[np.floating, CompactResponse]], rank: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Leading positive eigenpairs of C = sum_i w_i Y_i Y_i^T.
+    """Return the leading positive eigenpairs of C = sum_i w_i Y_i Y_i^T.
 
     Returns
     -------
@@ -203,7 +212,12 @@ def carried(
 
     Displacements of the clamped vertices are set to zero.
 
-    loads : LoadSurface of the template; surface : that of the patient
+    Parameters
+    ----------
+    loads : LoadSurface
+        LoadSurface of the template.
+    surface : LoadSurface
+        Surface that of the patient.
     """
     mesh = elasticity.mesh
     fields = interpolation_matrix(registration.mesh, mesh.vertices)
@@ -251,7 +265,7 @@ def _mapped(
 
 
 def by_component(matrix: sp.csr_matrix, values: FloatArray) -> FloatArray:
-    """A scalar interpolation applied to each component of nodal vectors, (3 n, rank)."""
+    """Return a scalar interpolation applied to each component of nodal vectors, (3 n, rank)."""
     rank = values.shape[1]
     mapped = matrix.astype(values.dtype) @ values.reshape(-1, 3 * rank)
     return np.asarray(mapped).reshape(-1, rank)

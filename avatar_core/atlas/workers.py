@@ -31,10 +31,14 @@ CONNECT_SECONDS = 10  # for a scheduler to answer
 class Workers:
     """Where tasks run.
 
-    jobs : processes on this machine; None for one per CPU, 1 for this process
-    scheduler : address of a Dask scheduler whose workers run them instead; they need avatar, too
-
     Raises AtlasError if there are no jobs.
+
+    Attributes
+    ----------
+    jobs : int or None
+        Processes on this machine; None for one per CPU, 1 for this process.
+    scheduler : str or None
+        Address of a Dask scheduler whose workers run them instead; they need avatar, too.
     """
 
     jobs: int | None = None
@@ -47,11 +51,14 @@ class Workers:
     def map(
         self, function: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterator[tuple[int, Result | Exception]]:
-        """Number of each item with its result, or with the error that ended it.
-
-        function, items : picklable, unless there is one job
+        """Return the number of each item with its result, or with the error that ended it.
 
         Raises AtlasError if no scheduler answers.
+
+        Parameters
+        ----------
+        function, items : Callable[[Item], Result]
+            Picklable, unless there is one job.
         """
         numbered = dict(enumerate(items))
         jobs = min(self.jobs or len(os.sched_getaffinity(0)), len(items))
@@ -81,7 +88,7 @@ def _in_processes(
 def _in_pool(
     function: Callable[[Item], Result], items: Mapping[int, Item], jobs: int
 ) -> Iterator[tuple[int, Result | Exception]]:
-    """Results, until a process dies."""
+    """Yield the results, until a process dies."""
     spawn = multiprocessing.get_context("spawn")  # threads of numerical libraries hang when forked
     with (
         _one_thread_each(),
@@ -154,7 +161,7 @@ def _call(function: Callable[[Item], Result], item: Item) -> Result:
 
 
 def _connected(address: str) -> tuple[Any, Any]:
-    """A client of the scheduler, and the as_completed that goes with it."""
+    """Return a client of the scheduler, and the as_completed that goes with it."""
     try:
         from distributed import Client
         from distributed import as_completed as completed

@@ -21,9 +21,12 @@ _MARGIN = 10  # periods around those that the guard alters
 
 
 def comparable(path: BagPath, found: Replayed, limits: ForceLimits) -> Replayed:
-    """A replay of a bag, its ``known`` reduced to what the bag allows to compare.
+    """Return a replay of a bag, its ``known`` reduced to what the bag allows to compare.
 
-    limits : of the force guard of the loop that answered
+    Parameters
+    ----------
+    limits : ForceLimits
+        Limits of the force guard of the loop that answered.
     """
     if path.answers == "states":
         return found
@@ -58,7 +61,7 @@ def why_not(path: BagPath) -> str:
 def _passed(
     force: FloatArray, received: np.ndarray, sound: np.ndarray, limits: ForceLimits
 ) -> np.ndarray:
-    """Whether the guard passes each force as it is, shape (n,)."""
+    """Return whether the guard passes each force as it is, shape (n,)."""
     guard, torque = ForceGuard(limits), np.zeros(3)
     altered = np.ones(len(force), bool)
     for k, one in enumerate(force):

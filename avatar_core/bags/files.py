@@ -30,15 +30,19 @@ _REMEDY = {
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path names a bag and no file of HDF5, by its name."""
+    """Return whether a path names a bag and no file of HDF5, by its name."""
     return path.is_dir() or path.suffix.lower() in (*SUFFIXES, ".bag", _ZSTD)
 
 
 class OpenBag:
     """A bag that is being read; a context manager, which closes it.
 
-    connections : the library's, one for each topic, type and file
-    notes : what could not be read, one line each
+    Parameters
+    ----------
+    connections
+        The library's, one for each topic, type and file.
+    notes
+        What could not be read, one line each.
 
     Raises
     ------
@@ -62,7 +66,7 @@ class OpenBag:
             self._stack.close()
 
     def messages(self, connections: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
-        """Connection, time of receipt [ns] and content of each message, file by file.
+        """Yield the connection, time of receipt [ns] and content of each message, file by file.
 
         A file that turns out to be damaged ends there, with a note.
         """
@@ -105,7 +109,7 @@ class OpenBag:
         return self._readers_of_files(self._listed(path, files))
 
     def _listed(self, path: Path, files: list[Path]) -> list[Path]:
-        """The files that metadata.yaml lists, or all without it."""
+        """Return the files that metadata.yaml lists, or all without it."""
         import yaml
 
         try:
@@ -158,7 +162,7 @@ class OpenBag:
             return reader
 
     def _decompressed(self, file: Path) -> Path:
-        """A copy of a compressed file, as far as it goes, for as long as the bag is open."""
+        """Return a copy of a compressed file, as far as it goes, for as long as the bag is open."""
         folder = self._stack.enter_context(TemporaryDirectory(prefix="avatar_bag_"))
         whole = Path(folder) / file.stem
         try:
@@ -190,7 +194,7 @@ class OpenBag:
 
 
 def _is_storage(file: Path) -> bool:
-    """Whether a file's name is that of messages, compressed or not."""
+    """Return whether a file's name is that of messages, compressed or not."""
     return (file.with_suffix("") if file.suffix == _ZSTD else file).suffix in SUFFIXES
 
 
@@ -201,7 +205,7 @@ def _in_order(file: Path) -> list[str | int]:
 
 
 def _unpacked(content: bytes) -> bytes:
-    """A message, whether it was compressed or not."""
+    """Return a message, whether it was compressed or not."""
     if content[:4] != _ZSTD_BEGINS:
         return content
     try:

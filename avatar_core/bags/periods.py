@@ -44,11 +44,18 @@ _UNIT = 1e-3  # by which a quaternion may differ from length 1, as in the loop
 class BagPath:
     """A recording that was found in a bag.
 
-    recording : its forces are zero if ``answers`` is "poses"
-    answers : "states", "wrenches" or "poses", which of them the periods are
-    received : (n,) when each answer was received [ns]
-    sound : (n,) whether the pose was valid, as far as the bag shows
-    notes : what was left out, one line each
+    Attributes
+    ----------
+    recording : Recording
+        Its forces are zero if ``answers`` is "poses".
+    answers : str
+        "states", "wrenches" or "poses", which of them the periods are.
+    received : ndarray
+        (n,) when each answer was received [ns].
+    sound : ndarray
+        (n,) whether the pose was valid, as far as the bag shows.
+    notes : tuple[str, ...]
+        What was left out, one line each.
     """
 
     recording: Recording
@@ -65,15 +72,19 @@ def path_of(
     transform: tuple[float, ...] | None = None,
     rate: float | None = None,
 ) -> BagPath:
-    """The recording of one tool.
+    """Return the recording of one tool.
 
     Parameters
     ----------
-    scene : YAML of the scene of one tool
-    vademecum_id : of the organ that the tool is to touch; states of others are left out
-    transform : pose of the poses' frame in the organ's, x y z [m] and quaternion x y z w; None if
-        they are in the organ's
-    rate : of the loop [Hz]; None for that of the answers
+    scene : str
+        YAML of the scene of one tool.
+    vademecum_id : str
+        Vademecum id of the organ that the tool is to touch; states of others are left out.
+    transform : tuple[float, ...] or None
+        Pose of the poses' frame in the organ's, x y z [m] and quaternion x y z w; None if they are
+        in the organ's.
+    rate : float or None
+        Rate of the loop [Hz]; None for that of the answers.
 
     Raises
     ------
@@ -130,7 +141,7 @@ def path_of(
 def valid_tips(
     bag: Bag, transform: tuple[float, ...] | None = None
 ) -> tuple[Table, FloatArray, list[str]]:
-    """The valid poses, their tips in the organ's frame (n, 3) [m], and notes.
+    """Return the valid poses, their tips in the organ's frame (n, 3) [m], and notes.
 
     transform, errors : as of :func:`path_of`
     """
@@ -207,7 +218,7 @@ def _leaps(tip: FloatArray) -> np.ndarray:
 
 
 def _numbers(received: np.ndarray, rate: float, lost: np.ndarray) -> np.ndarray:
-    """Numbers of the periods, shape (n,); a gap counts where it ends in a ``lost`` one."""
+    """Return numbers of the periods, shape (n,); a gap counts where it ends in a ``lost`` one."""
     periods = np.diff(received, prepend=received[:1]) * (rate * 1e-9)
     steps = np.where((periods > _GAP) & lost, np.rint(periods), 1.0).astype(np.int64)
     return np.cumsum(steps)
@@ -228,7 +239,7 @@ def _pose_of(poses: Table, answered: Table, answers: str) -> np.ndarray:
 
 
 def _placement(answers: str, table: Table, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Status of each period, and where its tip was."""
+    """Return the status of each period, and where its tip was."""
     n = len(table)
     if answers == "states":
         status = table.values[:, 0].astype(np.uint8)
@@ -245,7 +256,7 @@ def _placement(answers: str, table: Table, known: np.ndarray) -> tuple[np.ndarra
 
 
 def _is_stale(wrenches: Table) -> np.ndarray:
-    """Whether a wrench is zero because its pose is too old, shape (n,)."""
+    """Return whether a wrench is zero because its pose is too old, shape (n,)."""
     first = np.r_[True, np.diff(wrenches.stamp) != 0]
     since = wrenches.received[first][np.cumsum(first) - 1]
     old: np.ndarray = wrenches.received - since > _HELD * 1e9
@@ -261,13 +272,13 @@ def _of_organ(answers: str, table: Table, vademecum_id: str) -> np.ndarray:
 
 
 def _spoilt(received: np.ndarray, invalid: np.ndarray) -> np.ndarray:
-    """Whether a refused pose came between an answer and the one before it, shape (n,)."""
+    """Return whether a refused pose came between an answer and the one before it, shape (n,)."""
     came = np.searchsorted(np.sort(invalid), received, side="right")
     return np.diff(came, prepend=0) > 0
 
 
 def _parts(transform: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-    """Origin and rotation matrix of a pose.
+    """Return the origin and rotation matrix of a pose.
 
     Raises
     ------
@@ -291,7 +302,8 @@ def _moved(points: FloatArray, origin: FloatArray, rotation: FloatArray) -> Floa
 
 def _turned(orientations: FloatArray, frame: FloatArray) -> FloatArray:
     """Quaternions (n, 4) in the organ's frame, as the loop finds them; bit by bit the same if both
-    frames are one."""
+    frames are one.
+    """
     if np.array_equal(frame, IDENTITY[3:]):
         return orientations
     return np.stack(composed(frame, orientations.T), axis=1)
@@ -312,5 +324,5 @@ def _forces(
 
 
 def _column(answers: str, table: Table, column: int) -> FloatArray:
-    """A column of the states; NaN, unknown, without them."""
+    """Return a column of the states; NaN, unknown, without them."""
     return table.values[:, column] if answers == "states" else np.full(len(table), np.nan)

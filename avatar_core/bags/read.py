@@ -58,16 +58,27 @@ class About:
 class Bag:
     """What a bag holds of one tool.
 
-    tool : the part of its topics' names before ``/measured_cp``
-    poses : label: frame; values: position [m], unit quaternion x y z w
-    wrenches : label: frame; values: force [N]; None if the bag has none
-    wrench : name of their topic, after the tool's; "" without any
-    axes : of the wrenches: "absolute", "body" or "spatial"
-    states : label: id of the vademecum; values: status, force of the contacts [N], its estimated
-        error [N], fraction that was sent; None if the bag has none
-    vademecum_ids : that the bag names
-    about : of the recording that was written as a bag; None in other bags
-    notes : what could not be read or was left out, one line each
+    Attributes
+    ----------
+    tool : str
+        The part of its topics' names before ``/measured_cp``.
+    poses : Table
+        Label: frame; values: position [m], unit quaternion x y z w.
+    wrenches : Table or None
+        Label: frame; values: force [N]; None if the bag has none.
+    wrench : str
+        Name of their topic, after the tool's; "" without any.
+    axes : str
+        Axes of the wrenches: "absolute", "body" or "spatial".
+    states : Table or None
+        Label: id of the vademecum; values: status, force of the contacts [N], its estimated error
+        [N], fraction that was sent; None if the bag has none.
+    vademecum_ids : tuple[str, ...]
+        Vademecum ids that the bag names.
+    about : About or None
+        About of the recording that was written as a bag; None in other bags.
+    notes : tuple[str, ...]
+        What could not be read or was left out, one line each.
     """
 
     path: Path
@@ -92,10 +103,14 @@ def read_bag(
 
     Parameters
     ----------
-    path : folder with metadata.yaml, .mcap or .db3
-    tool : beginning of its topics' names, with or without namespace; None if there is only one
-    progress : called with the messages that were read, and how many there are
-    wrenches : topics of a tool that are read, and their axes; the first that has messages is taken
+    path : str or Path
+        Folder with metadata.yaml, .mcap or .db3.
+    tool : str or None
+        Beginning of its topics' names, with or without namespace; None if there is only one.
+    progress : Progress or None
+        Called with the messages that were read, and how many there are.
+    wrenches : Mapping[str, str]
+        Topics of a tool that are read, and their axes; the first that has messages is taken.
 
     Raises
     ------
@@ -117,7 +132,7 @@ def read_bag(
 
 
 def _chosen_tool(bag: OpenBag, tool: str | None) -> str:
-    """The beginning of the topics of the tool that is asked for, or of the only one."""
+    """Return the beginning of the topics of the tool that is asked for, or of the only one."""
     tools = {
         one.topic.removesuffix(f"/{POSES}")
         for one in bag.connections
@@ -224,7 +239,8 @@ class _Topics:
 
     def _states_of_tool(self) -> TableWriter | None:
         """States that name the tool; those of another name if they are the only ones, as remapped
-        topics are."""
+        topics are.
+        """
         for name, states in self._states.items():
             if self._tool.endswith(f"/{name}"):
                 return states
@@ -272,6 +288,6 @@ class _Topics:
 
 
 def _stamp(message: Any) -> int:
-    """[ns]"""
+    """Return [ns]"""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)

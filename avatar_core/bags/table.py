@@ -23,11 +23,18 @@ MAX_MESSAGES = 10_000_000  # of a topic: nearly three hours at 1 kHz, 700 MB
 class Table:
     """Messages in the order of their receipt.
 
-    received : (n,) when each was received [ns]
-    stamp : (n,) of its header [ns]
-    label : (n,) index into ``labels``
-    labels : texts, such as frames
-    values : (n, m)
+    Attributes
+    ----------
+    received : ndarray
+        (n,) when each was received [ns].
+    stamp : ndarray
+        (n,) of its header [ns].
+    label : ndarray
+        (n,) index into ``labels``.
+    labels : tuple[str, ...]
+        Texts, such as frames.
+    values : ndarray
+        (n, m).
     """
 
     received: np.ndarray
@@ -40,7 +47,7 @@ class Table:
         return len(self.stamp)
 
     def where(self, keep: np.ndarray) -> Table:
-        """The rows that a mask or an index selects."""
+        """Return the rows that a mask or an index selects."""
         return Table(
             self.received[keep], self.stamp[keep], self.label[keep], self.labels, self.values[keep]
         )
@@ -49,7 +56,10 @@ class Table:
 class TableWriter:
     """Collects rows of ``width`` numbers.
 
-    refused : messages that could not be decoded
+    Parameters
+    ----------
+    refused
+        Messages that could not be decoded.
     """
 
     def __init__(self, width: int) -> None:
@@ -93,7 +103,7 @@ class TableWriter:
         return [period - step for step in steps[back].tolist()]
 
     def table(self, set_back: Sequence[int] = ()) -> Table:
-        """The collected messages, sorted by the time of receipt; repeated messages once.
+        """Return the collected messages, sorted by the time of receipt; repeated messages once.
 
         set_back : as of :meth:`set_back`, of all topics
         """

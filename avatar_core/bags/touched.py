@@ -40,10 +40,15 @@ _ONE_CLOCK = 1_000_000_000  # between the delays of two topics that share a cloc
 class TouchFile:
     """A file with touches.
 
-    tool : of a bag of several tools, NAME of the topics NAME/measured_cp; of a recording, number of
-        the tool, from 1; None: the only one
-    transform : of a bag, pose of the poses' frame in the organ's: position [m] and quaternion
-    radius : of a bag, of the spherical tip [m]
+    Attributes
+    ----------
+    tool : str or None
+        Tool of a bag of several tools, NAME of the topics NAME/measured_cp; of a recording, number
+        of the tool, from 1; None: the only one.
+    transform : tuple[float, ...] or None
+        Transform of a bag, pose of the poses' frame in the organ's: position [m] and quaternion.
+    radius : float
+        Radius of a bag, of the spherical tip [m].
     """
 
     path: Path
@@ -55,7 +60,10 @@ class TouchFile:
 class Touched(NamedTuple):
     """Tip of a tool, times (n,) [s], positions (n, 3) [m] and forces, as a file has them.
 
-    vector : (n, 3) [N], in the sensor's axes
+    Attributes
+    ----------
+    vector : ndarray
+        (n, 3) [N], in the sensor's axes.
     """
 
     tip: Tip
@@ -121,7 +129,7 @@ def measured_path(file: TouchFile, progress: Progress | None = None) -> Touched:
 
 
 def _stamps_tell(poses: Table, wrenches: Table) -> bool:
-    """Whether the headers of both topics hold times of one clock."""
+    """Return whether the headers of both topics hold times of one clock."""
     late = []
     for one in (poses, wrenches):
         differ = np.diff(one.stamp) != 0
@@ -153,7 +161,7 @@ def _of_recording(file: TouchFile) -> Touched:
 def palpated(
     organ: Vademecum, touched: Touched, errors: Errors
 ) -> tuple[Palpation, Errors, tuple[str, ...]]:
-    """The touches of a file without the sensor's zero and lag, their errors, and all notes.
+    """Return the touches of a file without the sensor's zero and lag, their errors, and all notes.
 
     Raises
     ------

@@ -24,7 +24,7 @@ _FOOTER_BYTES = _HEAD.pack(_FOOTER, 20) + bytes(20) + MAGIC  # which refers to n
 
 
 def whole_records(path: Path) -> list[int]:
-    """Ends of the whole records of the data section [bytes]; empty if there is none."""
+    """Return the ends of the whole records of the data section [bytes]; empty if there is none."""
     ends: list[int] = []
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
@@ -42,7 +42,7 @@ def whole_records(path: Path) -> list[int]:
 
 
 def longest_readable(path: Path, opens: Callable[[CutPath], bool]) -> CutPath | None:
-    """The longest part of a file from its beginning that the library opens; None: none.
+    """Return the longest part of a file from its beginning that the library opens; None: none.
 
     opens : whether it opens a part; if it does not, it opens no longer one
     """

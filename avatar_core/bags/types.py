@@ -65,7 +65,7 @@ float64 build_cpu_seconds
 
 
 def rosbag2() -> ModuleType:
-    """The module of the library that reads and writes bags.
+    """Return the module of the library that reads and writes bags.
 
     Raises
     ------
@@ -81,13 +81,13 @@ def rosbag2() -> ModuleType:
 
 
 def zstd() -> ModuleType:
-    """Python's module for Zstandard, or the one that rosbags brings for older Pythons."""
+    """Return Python's module for Zstandard, or the one that rosbags brings for older Pythons."""
     return import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
 
 
 @lru_cache(maxsize=1)
 def typestore() -> Any:
-    """The library's store of the types of Jazzy, and of ``OWN``."""
+    """Return the library's store of the types of Jazzy, and of ``OWN``."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -102,6 +102,6 @@ def typestore() -> Any:
 
 
 def full_name(name: str) -> str:
-    """A type's name with the ``/msg/`` that some writers leave out."""
+    """Return a type's name with the ``/msg/`` that some writers leave out."""
     package, slash, rest = name.partition("/")
     return name if not slash or "/" in rest else f"{package}/msg/{rest}"

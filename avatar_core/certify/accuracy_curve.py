@@ -46,7 +46,7 @@ PATCH_TIP = Tip("patch", HEIGHTS[1] + 2e-3)  # in contact wherever a tip is draw
 
 
 def details_of(n_modes: int) -> tuple[Detail, ...]:
-    """The details that a curve is measured at: all combinations, and no cloud at all."""
+    """Return the details that a curve is measured at: all combinations, and no cloud at all."""
     shown = tuple(Detail(modes, cloud) for cloud in SHOWN for modes in mode_levels(n_modes))
     return (*shown, Detail(n_modes, "off"))
 
@@ -55,11 +55,17 @@ def details_of(n_modes: int) -> tuple[Detail, ...]:
 class StepErrors:
     """Relative errors of a step at unseen contacts, a column for each.
 
-    shown : ndarray, shape (n_details - 1, n), of the displacement that the step shows, at the force
-        that it feels; no row for no cloud
-    force : ndarray, shape (n,), of the force at the depth of the tip
-    smoothing : ndarray, shape (n,), relative change of the compliance under a tip by smoothing
-    sizes : of what shows each detail [bytes]
+    Attributes
+    ----------
+    shown : ndarray, shape (n_details - 1, n)
+        Shown of the displacement that the step shows, at the force that it feels; no row for no
+        cloud.
+    force : ndarray, shape (n,)
+        Force of the force at the depth of the tip.
+    smoothing : ndarray, shape (n,)
+        Relative change of the compliance under a tip by smoothing.
+    sizes : Sequence[int]
+        Sizes of what shows each detail [bytes].
     """
 
     shown: np.ndarray
@@ -73,7 +79,10 @@ def step_errors(
 ) -> StepErrors:
     """Press a patch at ``n`` unseen places by the compiled step, against full finite elements.
 
-    single : these in single precision
+    Parameters
+    ----------
+    single : bool
+        These in single precision.
     """
     contacts, levels = draw_contacts(vademecum, n, seed), mode_levels(vademecum.n_modes)
     vademecum = _bare(vademecum)
@@ -109,7 +118,7 @@ def _bare(vademecum: Vademecum) -> Vademecum:
 
 
 def pressed(data: ContactData, tip: np.ndarray) -> float:
-    """The force of a patch at a place that it comes to from nowhere [N]."""
+    """Return the force of a patch at a place that it comes to from nowhere [N]."""
     data.reset()
     status = solve(data.model, data, tip[None])
     if status != Status.OK:
@@ -122,7 +131,7 @@ def _square(field: np.ndarray, volume: np.ndarray) -> float:
 
 
 def _size(arrays: Any, level: int) -> int:
-    """Bytes of the modes up to a level, of their core and of the loads."""
+    """Return the bytes of the modes up to a level, of their core and of the loads."""
     share = float(np.mean(arrays.level <= level)) if len(arrays.level) else 0.0
     modes = arrays.space.nbytes + arrays.core.nbytes + arrays.level.nbytes
     return round(share * modes) + arrays.regional_load.nbytes
@@ -131,7 +140,7 @@ def _size(arrays: Any, level: int) -> int:
 def curve_of(
     vademecum: Vademecum, shown: np.ndarray, force: np.ndarray, sizes: Sequence[int]
 ) -> AccuracyCurve:
-    """The curve of measured errors, not yet timed.
+    """Return the curve of measured errors, not yet timed.
 
     Parameters
     ----------

@@ -36,9 +36,16 @@ _MAX_ITERATIONS = 30  # of Newton's method
 class CombinedRow:
     """One push: the error of its forces at equal depth.
 
-    site : accessible face whose centroid is pushed; depth [m]
-    contact : |F - F_FE| / |F_FE|; linear_contact : the same of the linear vademecum
-    within : the push lies in the stored range
+    Attributes
+    ----------
+    site : int
+        Accessible face whose centroid is pushed; depth [m].
+    contact : float
+        |F - F_FE| / |F_FE|.
+    linear_contact : float
+        The same of the linear vademecum.
+    within : bool
+        The push lies in the stored range.
     """
 
     combination: str
@@ -58,11 +65,16 @@ def push_errors(
     beyond: bool = False,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[CombinedRow]:
-    """Errors of every combination, site and depth that has an equilibrium.
+    """Return the errors of every combination, site and depth that has an equilibrium.
 
-    depths : increasing [m]
-    beyond : also where the vademecum says that a push leaves its stored range
-    progress : called with the fraction that is done
+    Parameters
+    ----------
+    depths : Sequence[float]
+        Increasing [m].
+    beyond : bool
+        Also where the vademecum says that a push leaves its stored range.
+    progress : Callable[[float], None]
+        Called with the fraction that is done.
     """
     rng = np.random.default_rng(seed)
     surface = vademecum.surface
@@ -119,7 +131,7 @@ class _Combined:
     preload: FloatArray | None = None
 
     def motion_under(self, force: FloatArray) -> FloatArray:
-        """d n, of each patch along its load [m]."""
+        """Return d n, of each patch along its load [m]."""
         a = self.normal_fraction * self.own * force
         added = [curve(x) for curve, x in zip(self.curves, a, strict=True)]
         return self.compliance @ force + self.normal_fraction * np.array(added)
@@ -145,11 +157,11 @@ class _Combined:
         )
 
     def linear_forces(self, depth: float) -> FloatArray:
-        """The same of the linear vademecum."""
+        """Return the same of the linear vademecum."""
         return np.linalg.solve(self.compliance, depth * self.motion)
 
     def reaches(self, depth: float) -> bool:
-        """Whether no tip goes beyond its reach."""
+        """Return whether no tip goes beyond its reach."""
         a = self.normal_fraction * self.own * self.forces(depth)
         return all(x <= curve.reach for curve, x in zip(self.curves, a, strict=True))
 
@@ -164,7 +176,7 @@ class _Site:
     loads: FloatArray  # (3 n_nodes, 3)
 
     def compliance(self, vademecum: Vademecum, other: _Site) -> FloatArray:
-        """C(s, s')."""
+        """Return C(s, s')."""
         return vademecum.compliance(self.positions, self.weights, other.positions, other.weights)
 
     def depth_curve(self, vademecum: Vademecum) -> _DepthCurve:
@@ -178,7 +190,7 @@ class _Site:
 def _at_site(
     v: Vademecum, problem: Hyperelasticity, triangle: int, rng: np.random.Generator
 ) -> dict[str, _Combined]:
-    """All combinations at one face, by name."""
+    """Return all combinations at one face, by name."""
     site = _site(v, problem, triangle)
     partner = _site(v, problem, _at_distance(v, triangle))
     found = (
@@ -190,7 +202,7 @@ def _at_site(
 
 
 def _oblique(v: Vademecum, site: _Site, angle: float) -> _Combined:
-    """A force 30 degrees off the inward normal moves its patch along itself."""
+    """Return a force 30 degrees off the inward normal moves its patch along itself."""
     across = np.linalg.svd(site.inward[None])[2][1:]
     sideways = np.cos(angle) * across[0] + np.sin(angle) * across[1]
     along = np.cos(OBLIQUE) * site.inward + np.sin(OBLIQUE) * sideways
@@ -206,7 +218,7 @@ def _oblique(v: Vademecum, site: _Site, angle: float) -> _Combined:
 
 
 def _two_tools(v: Vademecum, one: _Site, other: _Site) -> _Combined:
-    """Two patches pushed along their normals to one depth."""
+    """Return two patches pushed along their normals to one depth."""
     sites = (one, other)
     compliance = np.array(
         [[a.inward @ a.compliance(v, b) @ b.inward for b in sites] for a in sites]
@@ -241,7 +253,7 @@ def _states(
     depths: Sequence[float],
     progress: Callable[[float], None],
 ) -> Iterator[State]:
-    """Full equilibria at the depths, until there is none."""
+    """Yield the full equilibria at the depths, until there is none."""
     if not depths:
         return
     rule = NewtonRule(exact_stability=False)
@@ -253,7 +265,7 @@ def _states(
 
 
 def _row(name: str, site: int, combined: _Combined, state: State) -> CombinedRow:
-    """The vademecum beside a full equilibrium."""
+    """Return the vademecum beside a full equilibrium."""
     depth, truth = float(state.depth), state.force
     curved, linear = (
         float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
@@ -272,6 +284,6 @@ def _site(v: Vademecum, problem: Hyperelasticity, triangle: int) -> _Site:
 
 
 def _at_distance(v: Vademecum, triangle: int) -> int:
-    """The face whose centroid lies closest to 40 mm away."""
+    """Return the face whose centroid lies closest to 40 mm away."""
     distance = np.linalg.norm(v.surface.centroids - v.surface.centroids[triangle], axis=1)
     return int(np.abs(distance - APART).argmin())

@@ -51,9 +51,14 @@ LEAST_FACTOR = 0.5  # of the law's error: a few places by luck all well met prov
 class Site:
     """A place on the organ's surface.
 
-    kind : "drawn", "ridge", "hollow" or "edge"
-    point, normal : ndarray, shape (3,) [m], normal pointing out
-    kappa : mean curvature over ``ASIDE``, positive where convex [1/m]
+    Attributes
+    ----------
+    kind : str
+        "drawn", "ridge", "hollow" or "edge".
+    point, normal : ndarray, shape (3,)
+        Point and normal [m], normal pointing out.
+    kappa : float
+        Mean curvature over ``ASIDE``, positive where convex [1/m].
     """
 
     kind: str
@@ -94,7 +99,7 @@ class SiteContact:
 def with_contact_sites(
     vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int, progress: Progress = silent
 ) -> Vademecum:
-    """The vademecum, its certificate with the errors of resolved contacts at ``n`` places.
+    """Return the vademecum, its certificate with the errors of resolved contacts at ``n`` places.
 
     What could not be resolved is counted in a notice of the provenance.
     """
@@ -122,7 +127,7 @@ def contacts_at_sites(
     tips: Sequence[Tip] = SPHERES,
     depths: Sequence[float] = DEPTHS,
 ) -> tuple[list[SiteContact], list[str]]:
-    """The contacts of all sites, and notices that count what is missing.
+    """Return the contacts of all sites, and notices that count what is missing.
 
     Left out are places that the reference cannot resolve, and poses that the step refuses.
     """
@@ -177,15 +182,17 @@ def summarized(contacts: Sequence[SiteContact], factor: float = 1.0) -> ContactS
 
 
 def draw_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) -> list[Site]:
-    """Places drawn evenly over the accessible surface; the last two a ridge and a hollow.
+    """Return places drawn evenly over the accessible surface; the last two a ridge and a hollow.
 
     Not those at the border of the accessible surface, where the step's force fades on purpose: if
     most of it is border, there may be fewer than ``n``.
 
     Parameters
     ----------
-    surface : that the vademecum was built of
-    n : at least 3
+    surface : SurfaceMesh
+        Surface that the vademecum was built of.
+    n : int
+        n at least 3.
     """
     sites = _open_sites(vademecum, surface, max(DRAWN, 2 * n), seed)
     rest = sites[n - 2 :]
@@ -212,7 +219,7 @@ def _open_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) -
 
 
 def _thickness(surface: SurfaceMesh, site: Site) -> float:
-    """The organ's thickness along a site's normal [m]."""
+    """Return the organ's thickness along a site's normal [m]."""
     faces = surface.faces.astype(np.int64)
     start = site.point - _SKIN * site.normal
     hits = igl.ray_mesh_intersect(start, -site.normal, surface.vertices, faces)
@@ -220,7 +227,7 @@ def _thickness(surface: SurfaceMesh, site: Site) -> float:
 
 
 def nearest_sites(vademecum: Vademecum, surface: SurfaceMesh, near: np.ndarray) -> list[Site]:
-    """The places of the surface nearest to some points, shape (n, 3) [m]."""
+    """Return the places of the surface nearest to some points, shape (n, 3) [m]."""
     faces = surface.faces.astype(np.int64)
     points = igl.point_mesh_squared_distance(near, surface.vertices, faces)[2].reshape(-1, 3)
     return [_site(vademecum, point) for point in points]
@@ -241,7 +248,7 @@ def _site(vademecum: Vademecum, point: np.ndarray) -> Site:
 
 
 def _access(vademecum: Vademecum, site: Site) -> float:
-    """Access at the largest depth below a site."""
+    """Return the access at the largest depth below a site."""
     field, below = vademecum.tip_field, site.point - max(DEPTHS) * site.normal
     return float(evaluate(field.access, field.origin, field.spacing[0], below, np.zeros(3), 0.0))
 
@@ -267,7 +274,7 @@ def compared(
     models: Sequence[_Models],
     depths: Sequence[float] = DEPTHS,
 ) -> list[SiteContact]:
-    """The contacts of several tips at one site.
+    """Return the contacts of several tips at one site.
 
     Parameters
     ----------
@@ -321,7 +328,7 @@ def compared(
 
 
 def hertz_force(material: Material, radius: float, depth: np.ndarray | float) -> np.ndarray:
-    """4/3 E* sqrt(R d^3) on a sphere in a half-space, at depths of any shape [N]."""
+    """Return 4/3 E* sqrt(R d^3) on a sphere in a half-space, at depths of any shape [N]."""
     stiffness = material.plane_strain_modulus
     return np.asarray(4.0 / 3.0 * stiffness * np.sqrt(radius * np.asarray(depth) ** 3))
 

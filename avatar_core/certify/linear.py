@@ -41,10 +41,14 @@ def certify(
     Parameters
     ----------
     vademecum : Vademecum
-    elasticity : Elasticity, the problem it was built from
-    n_loads : unseen positions (all face centroids where the organ has fewer)
-    seed : of the random choice
-    progress : called with the number of positions done so far
+    elasticity : Elasticity
+        The problem it was built from.
+    n_loads : int
+        Unseen positions (all face centroids where the organ has fewer).
+    seed : int
+        Seed of the random choice.
+    progress : Callable[[int], None] or None
+        Called with the number of positions done so far.
     """
     errors = measured(vademecum, elasticity, n_loads, seed, progress, single=True)
     return certificate_of(vademecum, [errors], seed)
@@ -71,9 +75,12 @@ def measured(
     progress: Callable[[int], None] | None = None,
     single: bool = False,
 ) -> UnseenErrors:
-    """The errors that :func:`certify` sums up.
+    """Return the errors that :func:`certify` sums up.
 
-    single : against solutions in single precision where that serves, which pays for many loads
+    Parameters
+    ----------
+    single : bool
+        Against solutions in single precision where that serves, which pays for many loads.
     """
     surface = vademecum.surface
     single = single and _single_serves(vademecum, elasticity)
@@ -114,8 +121,7 @@ def _single_serves(vademecum: Vademecum, elasticity: Elasticity) -> bool:
 
 
 def certificate_of(vademecum: Vademecum, parts: Sequence[UnseenErrors], seed: int) -> Certificate:
-    """One certificate of all errors: at one choice of the coordinates, or at several."""
-
+    """Return one certificate of all errors: at one choice of the coordinates, or at several."""
     l2, contact, force = (
         np.concatenate([getattr(part, name) for part in parts])
         for name in ("l2", "contact", "force")
@@ -150,7 +156,7 @@ def _at_centroid(surface: LoadSurface, triangle: int) -> tuple[np.ndarray, np.nd
 def _reference(
     elasticity: Elasticity, centers: np.ndarray, vademecum: Vademecum, single: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Vertex displacements (n, 3 n_vertices, 3) and patch compliances (n, 3, 3)."""
+    """Return the vertex displacements (n, 3 n_vertices, 3) and patch compliances (n, 3, 3)."""
     loads = patch_loads(elasticity, centers, vademecum.surface.patch_radius)
     solution = elasticity.solve(loads, single)
     vertex = elasticity.at_vertices(solution).reshape(-1, len(centers), 3).transpose(1, 0, 2)
@@ -166,11 +172,12 @@ def _frobenius(estimate: np.ndarray, truth: np.ndarray) -> float:
 def mesh_error(
     vademecum: Vademecum, elasticity: Elasticity, n_loads: int = 8
 ) -> tuple[float, float]:
-    """Mean change of the reference itself when every tetrahedron is split into eight.
+    """Return the mean change of the reference itself when every tetrahedron is split into eight.
 
     Returns
     -------
-    l2, contact : relative changes of displacement at the vertices and of the patch compliance
+    l2, contact : float
+        Relative changes of displacement at the vertices and of the patch compliance.
     """
     refined = elasticity.refined()
     surface = vademecum.surface

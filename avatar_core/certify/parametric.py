@@ -39,7 +39,7 @@ def certify_range(
 
 
 def _certified_values(coordinates: Sequence[Coordinate], seed: int) -> list[dict[str, float]]:
-    """Values drawn evenly in each coordinate's own scale, and both corners of the range."""
+    """Return values drawn evenly in each coordinate's own scale, and both corners of the range."""
     rng = np.random.default_rng(seed)
     drawn = [{c.name: c.value_at(rng.random()) for c in coordinates} for _ in range(_DRAWN)]
     corners = [

@@ -31,8 +31,14 @@ MAX_DRAWS = 1000  # for one contact, on average; on livers most draws succeed
 class UnseenContacts:
     """Tips and the points that they touch, each (n, 3).
 
-    tip : centre of the sphere [m]; place : of the faces under its contact, the closest to
     tip - phi n [m]; normal : n, that the step presses along
+
+    Attributes
+    ----------
+    tip : ndarray
+        Centre of the sphere [m].
+    place : ndarray
+        Place of the faces under its contact, the closest to.
     """
 
     tip: np.ndarray
@@ -46,12 +52,15 @@ class UnseenContacts:
 
         Parameters
         ----------
-        single : solved in single precision
+        single : bool
+            Solved in single precision.
 
         Yields
         ------
-        compliance : n . C n of a patch at the place [m/N]
-        displacement : ndarray, shape (n_vertices, 3), by its unit force along n [m/N]
+        compliance
+            n . C n of a patch at the place [m/N].
+        displacement : ndarray, shape (n_vertices, 3)
+            By its unit force along n [m/N].
         """
         n = len(self.tip)
 
@@ -69,7 +78,7 @@ class UnseenContacts:
 
 
 def draw_contacts(vademecum: Vademecum, n: int, seed: int) -> UnseenContacts:
-    """Tips above points that are drawn evenly over the accessible faces.
+    """Return the tips above points that are drawn evenly over the accessible faces.
 
     Each can come in along its normal: no other lobe of the organ hangs over it.
 
@@ -110,7 +119,7 @@ def draw_contacts(vademecum: Vademecum, n: int, seed: int) -> UnseenContacts:
 
 
 def _is_obstructed(field: TipField, tip: np.ndarray, normal: np.ndarray) -> bool:
-    """Whether the organ itself is in the way of a tip along its normal."""
+    """Return whether the organ itself is in the way of a tip along its normal."""
     way = tip + np.outer(_WAY, normal)
     slope = np.zeros(3)
     return min(_at(field, field.distance, p, slope, outside=np.inf) for p in way) <= 0.0

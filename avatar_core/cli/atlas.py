@@ -189,7 +189,7 @@ def _grown(
     jobs: int | None,
     scheduler: str | None,
 ) -> Growth:
-    """The atlas after its growth; says after Ctrl-C how to go on."""
+    """Return the atlas after its growth; says after Ctrl-C how to go on."""
     from avatar_core.atlas.response import ResponseSolver
     from avatar_core.atlas.workers import Workers
 
@@ -221,7 +221,7 @@ def _report(folder: Path, growth: Growth) -> None:
 def _sources(
     surfaces: Sequence[str], unit: str, axes: str | None, label: str | None
 ) -> list[Source]:
-    """The surfaces named, those of a folder in the order of their names."""
+    """Return the surfaces named, those of a folder in the order of their names."""
     from avatar_core.atlas.growth import SurfaceFile
     from avatar_core.geometry.phantom import phantom_liver
     from avatar_core.geometry.surface import METRES, axes_matrix

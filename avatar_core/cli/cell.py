@@ -93,7 +93,7 @@ def cell(
 
 
 def _library(given: Path | None, params: Path | None) -> Path | None:
-    """The folder of the vademecums; nodes start in another one."""
+    """Return the folder of the vademecums; nodes start in another one."""
     if given is None and params is None:
         return Path.cwd()
     return given and given.resolve()

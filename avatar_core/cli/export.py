@@ -1,5 +1,6 @@
 """``avatar export``: a vademecum as a mesh for ParaView, or as deformed surfaces for 3D Slicer; a
-recording as MCAP."""
+recording as MCAP.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +52,8 @@ def export(
     ] = "LPS",
 ) -> None:
     """Export an organ under a load: a mesh for ParaView, or deformed surfaces for 3D Slicer. Export
-    a recording as MCAP."""
+    a recording as MCAP.
+    """
     from avatar_core.bags.files import MCAP
     from avatar_core.contact.tool_path import middle_of_access
     from avatar_core.geometry.surface import METRES

@@ -48,7 +48,7 @@ app.command()(cell)
 
 
 def main() -> int:
-    """Entry point: errors of the input become one line and exit code 1."""
+    """Return the entry point: errors of the input become one line and exit code 1."""
     try:
         code = app(standalone_mode=False)
     except AvatarError as error:

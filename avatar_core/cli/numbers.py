@@ -18,7 +18,7 @@ ToolTransform = Annotated[
 
 
 def numbers(option: str, text: str, counts: tuple[int, ...], remedy: str) -> list[float]:
-    """The numbers of an option, separated by commas.
+    """Return the numbers of an option, separated by commas.
 
     Raises AvatarError, with the remedy, unless there are as many as one of the counts.
     """
@@ -32,7 +32,7 @@ def numbers(option: str, text: str, counts: tuple[int, ...], remedy: str) -> lis
 
 
 def pose_of(text: str | None) -> tuple[float, ...] | None:
-    """Position [m] and quaternion of ``--tool-transform``, x,y,z,x,y,z,w, if it is given."""
+    """Return position [m] and quaternion of ``--tool-transform``, x,y,z,x,y,z,w, if it is given."""
     if text is None:
         return None
     return tuple(numbers("--tool-transform", text, (7,), "seven numbers, as 0,0,0.1,0,0,0,1"))

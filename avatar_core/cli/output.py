@@ -67,7 +67,7 @@ def _require_writable(folder: Path) -> None:
 
 
 def same_file(one: str | Path, other: str | Path) -> bool:
-    """Whether both exist and are one file, through links too."""
+    """Return whether both exist and are one file, through links too."""
     try:
         return os.path.samefile(one, other)
     except (OSError, ValueError):

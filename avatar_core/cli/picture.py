@@ -26,8 +26,14 @@ RESOLVED = (1e-3, 2e-3, 3e-3, 4e-3, 5e-3)  # depths at which contact is resolved
 class ForceCurve:
     """Normal forces on ``TIP`` at one place, over its depth.
 
-    depth : (n,) [m]; force, error, hertz : (n,) of the step, its error as it is said, and of a
     half-space [N]; resolved : (len(RESOLVED),) of resolved contact [N], None where there is none
+
+    Attributes
+    ----------
+    depth : ndarray
+        (n,) [m].
+    force, error, hertz : ndarray
+        (n,) of the step, its error as it is said, and of a.
     """
 
     depth: np.ndarray
@@ -37,7 +43,7 @@ class ForceCurve:
     resolved: np.ndarray | None
 
     def misses(self, force: np.ndarray) -> float:
-        """Largest relative difference of some forces from the resolved ones."""
+        """Return the largest relative difference of some forces from the resolved ones."""
         assert self.resolved is not None
         found = np.interp(RESOLVED, self.depth, force)
         return float(np.abs(found / self.resolved - 1.0).max())
@@ -82,7 +88,7 @@ def force_curve(
     data: ContactData,
     progress: Callable[[float], None] | None = None,
 ) -> ForceCurve:
-    """The forces at a place; the data are left at the largest depth."""
+    """Return the forces at a place; the data are left at the largest depth."""
     depth = np.linspace(0.0, max(RESOLVED), 51)
     force, error = np.empty_like(depth), np.empty_like(depth)
     for k, at in enumerate(depth):
@@ -95,7 +101,7 @@ def force_curve(
 def _resolved(
     vademecum: Vademecum, surface: SurfaceMesh, site: Site, progress: Callable[[float], None] | None
 ) -> np.ndarray | None:
-    """Forces of resolved contact at ``RESOLVED``; None where the mesh does not allow it."""
+    """Return forces of resolved contact at ``RESOLVED``; None where the mesh does not allow it."""
     organ = (surface, vademecum.mesh, vademecum.regions, vademecum.material)
     place = (site.point, site.normal, (TIP,), RESOLVED)
     try:

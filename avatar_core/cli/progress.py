@@ -59,7 +59,7 @@ def stage_bar(stages: dict[str, float] | None = None) -> Iterator[Progress]:
 
 
 def build_stages(large: bool = False, contact_sites: int = 0) -> dict[str, float]:
-    """The stages of a build, ``contact_sites`` among them or none."""
+    """Return the stages of a build, ``contact_sites`` among them or none."""
     total = 1.0 + _PER_SITE * contact_sites
     *first, last = ((name, part / total) for name, part in (_LARGE if large else _LINEAR).items())
     return dict([*first, ("contacts", 1.0 - 1.0 / total), last])

@@ -159,7 +159,7 @@ def _shown(vademecum: Vademecum, found: Registered) -> list[Estimate]:
 
 
 def _sentence(one: Estimate) -> str:
-    """Displacement of a target with the standard deviations, and where it is."""
+    """Return the displacement of a target with the standard deviations, and where it is."""
     import numpy as np
 
     size = 1e3 * float(np.linalg.norm(one.displacement))
@@ -218,7 +218,7 @@ def _write(vademecum: Vademecum, found: Registered, output: Path) -> None:
 
 
 def _summary(vademecum: Vademecum, found: Registered, estimates: list[Estimate]) -> dict[str, Any]:
-    """All figures; lengths in m, angles in degrees, forces in N."""
+    """Return all figures; lengths in m, angles in degrees, forces in N."""
     import numpy as np
 
     from avatar_core.registration.register import strongest_forces

@@ -142,7 +142,7 @@ def _identity(bag: Bag, organ: Vademecum) -> list[str]:
 
 
 def _scene_of(bag: Bag, name: str | None, organ: Vademecum) -> str:
-    """The scene of one tool that is given, that the bag holds, or the default, as YAML."""
+    """Return the scene of one tool that is given, that the bag holds, or the default, as YAML."""
     from avatar_core.contact.layout import default_effects
     from avatar_core.geometry.tip import Tip
     from avatar_core.scene.file import read_scene, scene_path, write_scene

@@ -140,7 +140,7 @@ def _show_large(v: Vademecum) -> None:
 
 
 def supported_area(v: Vademecum, support: Support) -> float:
-    """Area of the surface that a support holds [m^2]."""
+    """Return the area of the surface that a support holds [m^2]."""
     return float(v.mesh.face_areas[support.faces].sum())
 
 

@@ -84,7 +84,7 @@ def uncertainty(
 
 
 def given_of(given: list[str]) -> dict[str, Distribution]:
-    """The distributions that options ``--given`` say."""
+    """Return the distributions that options ``--given`` say."""
     from avatar_core.uncertainty.distributions import parse, read_distributions
 
     found: dict[str, Distribution] = {}
@@ -125,7 +125,7 @@ def _places(vademecum: Vademecum, at: list[str] | None) -> list[int]:
 
 
 def _target(vademecum: Vademecum, text: str | None) -> int:
-    """The vertex whose displacement is asked for."""
+    """Return the vertex whose displacement is asked for."""
     import numpy as np
 
     vertices = vademecum.mesh.vertices

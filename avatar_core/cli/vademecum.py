@@ -295,7 +295,7 @@ def show(file: File, as_json: AsJson = False) -> None:
 
 
 def _resection_summary(v: Vademecum) -> dict[str, Any] | None:
-    """Opening, volumes of both parts [m^3] and margins [m], for ``avatar show --json``."""
+    """Return opening, volumes of both parts [m^3] and margins [m], for ``avatar show --json``."""
     from avatar_core.vademecum.resected import margins, part_volumes
 
     if v.resection is None:
@@ -304,7 +304,7 @@ def _resection_summary(v: Vademecum) -> dict[str, Any] | None:
 
 
 def _large_summary(v: Vademecum) -> dict[str, Any] | None:
-    """Large deformation, for ``avatar show --json``."""
+    """Return the large deformation, for ``avatar show --json``."""
     if v.large is None:
         return None
     certificate = asdict(v.large.certificate) if v.large.certificate else None
@@ -314,7 +314,7 @@ def _large_summary(v: Vademecum) -> dict[str, Any] | None:
 def read_organ(
     surface: str, unit: str, axes: str | None, label: str | None, inside: Sequence[str] = ()
 ) -> SurfaceMesh:
-    """A surface from a file, or the built-in liver; see ``read_surface``.
+    """Return a surface from a file, or the built-in liver; see ``read_surface``.
 
     Prints at once what was read: whatever is refused later, this may say why.
     """
@@ -364,7 +364,7 @@ def _read_tumour(
 
 
 def parsed_axes(axes: str | None) -> Any:
-    """A name of axes, 16 numbers as a 4x4 matrix, or None for those of the file."""
+    """Return a name of axes, 16 numbers as a 4x4 matrix, or None for those of the file."""
     if axes is None:
         return None
     numbers = axes.replace(",", " ").split()

@@ -21,7 +21,7 @@ _SHORT, _HALF = np.dtype(np.int16), np.dtype(np.float16)
 
 
 def require_shapes(arrays: Mapping[str, np.ndarray], shapes: Shapes) -> dict[str, int]:
-    """The size of each name.
+    """Return the size of each name.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def require_indices(key: str, index: np.ndarray, limit: int) -> None:
 
 
 def _fits(shape: tuple[int, ...], names: list[str], sizes: dict[str, int]) -> bool:
-    """Whether a shape has the sizes of its names; a name that is new takes its size."""
+    """Return whether a shape has the sizes of its names; a name that is new takes its size."""
     if len(shape) != len(names):
         return False
     for n, name in zip(shape, names, strict=True):

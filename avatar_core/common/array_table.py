@@ -54,15 +54,18 @@ def array(shape: str, dtype: Any = np.float64, start: float = 0.0) -> Declared:
 
 
 def kind(name: str, **members: Any) -> Any:
-    """A named tuple of arrays, and of other kinds, which may be None in it."""
+    """Return a named tuple of arrays, and of other kinds, which may be None in it."""
     tuple_of: Any = namedtuple(name, members)  # type: ignore[misc]
     return type(name, (tuple_of,), {"__slots__": (), "members": members})
 
 
 def allocate(of: Any, sizes: Mapping[str, int], **given: Any) -> Any:
-    """A tuple of a kind with all arrays at their first value, but those that are given.
+    """Return a tuple of a kind with all arrays at their first value, but those that are given.
 
-    sizes : of the dimensions that have names; nested kinds are None unless given
+    Parameters
+    ----------
+    sizes : Mapping[str, int]
+        Sizes of the dimensions that have names; nested kinds are None unless given.
     """
 
     def made(name: str, member: Any) -> Any:
@@ -75,7 +78,7 @@ def allocate(of: Any, sizes: Mapping[str, int], **given: Any) -> Any:
 
 
 def sizes_of(arrays: Any) -> dict[str, int]:
-    """The dimensions of a tuple's arrays by name."""
+    """Return the dimensions of a tuple's arrays by name."""
     pairs = (
         zip(member.shape, getattr(arrays, name).shape, strict=True)
         for name, member in arrays.members.items()
@@ -97,7 +100,7 @@ def restart(arrays: Any, kept: Iterable[str] = ()) -> None:
 
 
 def flat(arrays: Any, prefix: str = "") -> dict[str, np.ndarray]:
-    """All arrays by name, as "distance" or "friction.coefficients"."""
+    """Return all arrays by name, as "distance" or "friction.coefficients"."""
     found: dict[str, np.ndarray] = {}
     for name, value in arrays._asdict().items():
         if isinstance(value, np.ndarray):
@@ -108,7 +111,7 @@ def flat(arrays: Any, prefix: str = "") -> dict[str, np.ndarray]:
 
 
 def gathered(of: Any, arrays: Mapping[str, np.ndarray], prefix: str = "") -> Any:
-    """The inverse of :func:`flat`; None for a kind of which there is no array."""
+    """Return the inverse of :func:`flat`; None for a kind of which there is no array."""
     if prefix and not any(name.startswith(prefix) for name in arrays):
         return None
     return of(
@@ -124,9 +127,13 @@ def gathered(of: Any, arrays: Mapping[str, np.ndarray], prefix: str = "") -> Any
 class ArrayTable:
     """Where the arrays of a tuple lie, and those of the tuples in it.
 
-    arrays : the tuple, kept alive
+    Parameters
+    ----------
+    arrays : Any
+        The tuple, kept alive.
     numba_type : TableType
-    address : of the table, for compiled code
+    address
+        Address of the table, for compiled code.
 
     Raises
     ------
@@ -219,7 +226,7 @@ def _read(context: Any, builder: Any, of: TableType, table: Any, name: str) -> A
 
 
 def _array(context: Any, builder: Any, of: Any, first: Any) -> Any:
-    """An array from its words: where it lies, its shape, its strides."""
+    """Return an array from its words: where it lies, its shape, its strides."""
     array = make_array(of)(context, builder)
     words = [builder.bitcast(first, array.data.type.as_pointer())]
     words += [builder.gep(first, [_WORD(i)], inbounds=True) for i in range(1, _n_words(of))]

@@ -11,7 +11,7 @@ Soup = tuple[FloatArray, IntArray]  # points and triangles
 
 
 def short(values: FloatArray) -> NDArray[np.float32]:
-    """Values of 12 significant bits, which compress: off by 1.2e-4 of each at most."""
+    """Return the values of 12 significant bits, which compress: off by 1.2e-4 of each at most."""
     bits = np.asarray(values, np.float32).view(np.uint32)
     return ((bits + np.uint32(1 << 11)) & np.uint32(0xFFFFF000)).view(np.float32)
 
@@ -21,8 +21,12 @@ def farthest_points(points: FloatArray, n: int, first: int = 0) -> IntArray:
 
     Parameters
     ----------
-    points : ndarray, shape (n_points, 3) [m]
-    n : how many, all of them at most; first : the one to begin with
+    points : ndarray, shape (n_points, 3)
+        Points [m].
+    n : int
+        How many, all of them at most.
+    first : int
+        The one to begin with.
 
     Returns
     -------

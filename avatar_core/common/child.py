@@ -153,12 +153,12 @@ class Child:
 
 
 def how_it_ended(code: int) -> str:
-    """The exit code of a process in words."""
+    """Return the exit code of a process in words."""
     return signal.strsignal(-code) or f"signal {-code}" if code < 0 else f"exit code {code}"
 
 
 def computed_by(pid: int) -> float:
-    """Processor time of a process since its start, without its children's [s]."""
+    """Return the processor time of a process since its start, without its children's [s]."""
     user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
     return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 

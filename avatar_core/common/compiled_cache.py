@@ -37,7 +37,7 @@ _KEPT = 8  # folders of other contents, for the versions that are in use side by
 
 @functools.cache
 def content() -> str:
-    """Hash of all sources that compiled functions may be made of."""
+    """Return the hash of all sources that compiled functions may be made of."""
     found = hashlib.sha256()
     for room in ROOMS:
         for file in sorted((_PACKAGE / room).rglob("*.py")):

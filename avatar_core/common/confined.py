@@ -70,7 +70,8 @@ class Confined:
 
     Parameters
     ----------
-    max_bytes : address space, beyond that of the process before its first call [bytes]
+    max_bytes : int
+        Address space, beyond that of the process before its first call [bytes].
     """
 
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:
@@ -90,14 +91,15 @@ class Confined:
     def call(
         self, seconds: float, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs
     ) -> R:
-        """``function(*args, **kwargs)``; all of them can be pickled.
+        """Return ``function(*args, **kwargs)``; all of them can be pickled.
 
         ``Imported`` in place of a function keeps this process free of what the function needs.
 
         Parameters
         ----------
-        seconds : of processor time that it may take, whatever else the machine has to do; what it
-            imports while it is loaded does not count [s]
+        seconds : float
+            Seconds of processor time that it may take, whatever else the machine has to do; what it
+            imports while it is loaded does not count [s].
 
         Raises
         ------

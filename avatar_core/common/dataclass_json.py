@@ -34,7 +34,7 @@ def plain(value: Any) -> Any:
 
 
 def parsed(text: str, key: str) -> Any:
-    """The value of JSON text.
+    """Return the value of JSON text.
 
     Raises
     ------
@@ -54,7 +54,8 @@ def of_plain(kind: type[Kind], value: Any, key: str) -> Kind:
 
     Parameters
     ----------
-    key : where the value stands, for errors
+    key : str
+        Key where the value stands, for errors.
 
     Raises
     ------
@@ -70,7 +71,7 @@ def of_plain(kind: type[Kind], value: Any, key: str) -> Kind:
 
 
 def require_name(name: Any, key: str) -> str:
-    """The name, if it is one line of printable text; StorageError otherwise."""
+    """Return the name, if it is one line of printable text; StorageError otherwise."""
     if not isinstance(name, str) or not name.isprintable() or len(name) > MAX_NAME:
         raise StorageError(
             f"'{key}' is no name of at most {MAX_NAME} printable letters; build the file again"

@@ -47,7 +47,7 @@ def opened(path: Path, max_bytes: int) -> Iterator[BinaryIO]:
 
 
 def content_of(source: BinaryIO) -> bytes:
-    """The bytes of an open file; FileError if it grows during reading."""
+    """Return the bytes of an open file; FileError if it grows during reading."""
     size = os.fstat(source.fileno()).st_size
     try:
         content = source.read(size + 1)  # allocates no more than this
@@ -86,7 +86,7 @@ def replaced(path: Path) -> Iterator[Path]:
 
 
 def shipped(folder: str) -> dict[str, Path]:
-    """The YAML files in a folder of ``params``, by name without suffix; sorted.
+    """Return the YAML files in a folder of ``params``, by name without suffix; sorted.
 
     They lie in ``params`` of a checkout, or below the prefix that pip or colcon installed this
     package into.

@@ -37,8 +37,11 @@ def replace_file(
 ) -> None:
     """Write arrays and attributes with their checksum, replacing a file atomically.
 
-    packed : compress large arrays, without loss; not for arrays that are almost constant, as what
-        a file claims may exceed its size ``MAX_EXPANSION`` times only
+    Parameters
+    ----------
+    packed : bool
+        Compress large arrays, without loss; not for arrays that are almost constant, as what a file
+        claims may exceed its size ``MAX_EXPANSION`` times only.
 
     Raises
     ------
@@ -53,7 +56,7 @@ def replace_file(
 def encoded(
     arrays: dict[str, np.ndarray], attributes: dict[str, str], packed: bool = False
 ) -> memoryview:
-    """The HDF5 file in memory: on a full disk, HDF5 itself would crash."""
+    """Return the HDF5 file in memory: on a full disk, HDF5 itself would crash."""
     content = io.BytesIO()
     # the latest layout keeps an array of one chunk without an index, in which damage would hide
     with h5py.File(content, "w", libver="latest") as file:
@@ -68,7 +71,7 @@ def encoded(
 
 
 def checksum(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
-    """SHA-256 of names, types, shapes and values."""
+    """Return SHA-256 of names, types, shapes and values."""
     digest = hashlib.sha256()
     for key in sorted(attributes):
         digest.update(f"{key}={attributes[key]};".encode())
@@ -91,11 +94,16 @@ def verified(
 
     Parameters
     ----------
-    source : the file
-    origin, what : name and kind of the file in messages
-    attributes_of : selects the attributes to verify among those held; raises StorageError
-    keys_of : selects the arrays to read among those held
-    remedy : what messages advise
+    source : BinaryIO
+        The file.
+    origin, what : str
+        Name and kind of the file in messages.
+    attributes_of : Callable[[Attributes, str], Attributes]
+        Selects the attributes to verify among those held; raises StorageError.
+    keys_of : Callable[[Collection[str]], Iterable[str]]
+        Selects the arrays to read among those held.
+    remedy : str
+        What messages advise.
 
     Raises
     ------
@@ -177,7 +185,10 @@ def _array(key: str, dataset: h5py.Dataset) -> np.ndarray:
 def require_schema(attributes: Attributes, present: str, origin: str, remedy: str) -> None:
     """Raise StorageError unless this version of the project reads a file's schema.
 
-    remedy : what makes an older file anew
+    Parameters
+    ----------
+    remedy : str
+        What makes an older file anew.
     """
     schema = attributes["schema"]
     major, _, minor = schema.partition(".")

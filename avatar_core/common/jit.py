@@ -25,7 +25,7 @@ _NO_WRAPPERS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": 
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator: compile by numba with its options, and keep the result by content."""
+    """Compile by numba with its options, and keep the result by content."""
 
     def compile_function(function: Callable[..., Any]) -> Any:
         dispatcher: Any = njit(**options)(function)
@@ -55,12 +55,12 @@ entry = compiled(**_STEP)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """Part of the step, exact about infinities and order."""
+    """Return the part of the step, exact about infinities and order."""
     return _part(function)
 
 
 def fast(function: Callable[..., Any]) -> Any:
-    """Part of the step that may be reordered for speed."""
+    """Return the part of the step that may be reordered for speed."""
     return _part(function, fastmath=True)
 
 

@@ -26,23 +26,23 @@ _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMBA", "RAYON", "IGL")
 
 
 def thread_limits(n_threads: int = 1) -> dict[str, str]:
-    """Environment variables that limit the threads of each numerical library."""
+    """Return the environment variables that limit the threads of each numerical library."""
     return {f"{library}_NUM_THREADS": str(n_threads) for library in _LIBRARIES}
 
 
 def cpu_seconds() -> float:
-    """User + system time of this process so far, and of its children that have ended [s]."""
+    """Return user + system time of this process so far, and of its children that have ended [s]."""
     return sum(os.times()[:4])
 
 
 def n_cores() -> int:
-    """Cores that this process may use, at most those that ``OMP_NUM_THREADS`` allows."""
+    """Return the cores that this process may use, at most those that ``OMP_NUM_THREADS`` allows."""
     cores, allowed = len(os.sched_getaffinity(0)), os.environ.get("OMP_NUM_THREADS", "")
     return min(cores, int(allowed)) if allowed.isdigit() and int(allowed) > 0 else cores
 
 
 def on_all_cores(function: Callable[[Item], T], items: Iterable[Item]) -> Iterator[T]:
-    """The function of each item, in their order, in one thread for each core.
+    """Yield the function of each item, in their order, in one thread for each core.
 
     For functions that spend their time outside the interpreter, and give the same bits whatever
     runs beside them. What has not begun is left out where the caller stops.
@@ -70,11 +70,11 @@ def free_at_once() -> None:
 
 
 def repeatable(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorator: the same arguments give the same bits, with any number of threads allowed.
+    """Make a function repeatable: the same arguments give the same bits, on any number of cores.
 
-    On two threads BLAS adds in another order than on one, and modes of almost equal energy come
-    out mixed otherwise: the same accuracy from other numbers. One thread costs less processor
-    time (22 s for 28 s, 700 vertices).
+    On two threads BLAS adds in another order than on one. Modes of almost equal energy then come
+    out mixed: the same accuracy from other numbers. One thread costs less processor time (22 s for
+    28 s, 700 vertices).
     """
 
     @functools.wraps(function)
@@ -92,7 +92,12 @@ class ModuleProcess(subprocess.Popen[Any]):
     ends it. Its directory is ``/``, because ``-m`` prefers what lies in the current directory to
     what is installed.
 
-    environment : None for that of this process; options : of ``subprocess.Popen``
+    Parameters
+    ----------
+    environment : Mapping[str, str] or None
+        None for that of this process.
+    options
+        Options of ``subprocess.Popen``.
     """
 
     def __init__(

@@ -29,12 +29,12 @@ class Quantity:
 
 
 def quantity(unit: str, low: float, high: float, text: str, default: Any = MISSING) -> Any:
-    """A dataclass field for a number, or a tuple of numbers, with unit and range."""
+    """Return a dataclass field for a number, or a tuple of numbers, with unit and range."""
     return field(default=default, metadata={"quantity": Quantity(unit, low, high, text)})
 
 
 def lies_in(value: Any, allowed: Quantity, whole: bool = False) -> bool:
-    """Whether something is a number, or a whole one, within a range."""
+    """Return whether something is a number, or a whole one, within a range."""
     kinds = int if whole else (int, float)
     if not isinstance(value, kinds) or isinstance(value, bool):
         return False
@@ -42,7 +42,7 @@ def lies_in(value: Any, allowed: Quantity, whole: bool = False) -> bool:
 
 
 def is_whole(owner: type, key: str) -> bool:
-    """Whether a field of a dataclass takes whole numbers only."""
+    """Return whether a field of a dataclass takes whole numbers only."""
     return get_type_hints(owner)[key] in (int, int | None)
 
 

@@ -34,8 +34,10 @@ def cell_at(origin, spacing, p):  # type: ignore[no-untyped-def]
 
     Returns
     -------
-    first : three indices of the first sample
-    weights, slopes : three triples each, B and dB/dp along x, y and z [-, 1/m]
+    first
+        Three indices of the first sample.
+    weights, slopes
+        Three triples each, B and dB/dp along x, y and z [-, 1/m].
     """
     scale = 1.0 / spacing
     x, y, z = (p[0] - origin[0]) * scale, (p[1] - origin[1]) * scale, (p[2] - origin[2]) * scale
@@ -118,7 +120,10 @@ def second_derivatives(values, cell, spacing, hessian):  # type: ignore[no-untyp
 def add_in_bricks(brick, values, cell, gradient):  # type: ignore[no-untyped-def]
     """Value of a field in bricks; its gradient [1/m] is added to ``gradient``.
 
-    values : (n_bricks, BRICK, BRICK, BRICK); all samples of the cell lie in ``brick``
+    Parameters
+    ----------
+    values
+        (n_bricks, BRICK, BRICK, BRICK); all samples of the cell lie in ``brick``.
     """
     (nx, ny, nz), (wx, wy, wz), (dx, dy, dz) = cell
     value = 0.0

@@ -21,8 +21,12 @@ if TYPE_CHECKING:
 class CloudArrays(NamedTuple):
     """The arrays of the same names in :class:`avatar_core.contact.layout.MODEL`, and their source.
 
-    vertex : of the mesh, in each place of the blocks; -1 where a block is not full
-    large_start : as ``region_start``, of the modes of large deformation, which come last
+    Attributes
+    ----------
+    vertex : ndarray
+        Vertex of the mesh, in each place of the blocks; -1 where a block is not full.
+    large_start : ndarray
+        As ``region_start``, of the modes of large deformation, which come last.
     """
 
     space: np.ndarray
@@ -38,7 +42,7 @@ class CloudArrays(NamedTuple):
 def cloud_arrays(
     vademecum: Vademecum, cloud: Cloud, large: BlockField | None = None
 ) -> CloudArrays:
-    """The blocks of a cloud, of the vademecum's field and of what large deformation adds."""
+    """Return the blocks of a cloud, of the vademecum's field and of what large deformation adds."""
     field, n_blocks = vademecum.field, shown_blocks(vademecum, cloud)
     parts, start = [_first_blocks(field, n_blocks)], np.cumsum(field.count, dtype=np.int64)
     large_start = np.full_like(start, start[-1])
@@ -51,7 +55,7 @@ def cloud_arrays(
 
 
 def shown_vertices(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:
-    """Vertices of the mesh that a cloud shows, or that carry what it shows, ascending."""
+    """Return vertices of the mesh that a cloud shows, or that carry what it shows, ascending."""
     # Here, because the contact node needs none of it.
     from avatar_core.vademecum.display import displayed_vertices
 
@@ -63,7 +67,7 @@ def shown_vertices(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:
 
 
 def shown_blocks(vademecum: Vademecum, cloud: Cloud) -> int:
-    """Blocks that hold these."""
+    """Return the blocks that hold these."""
     return vademecum.blocks.that_hold(shown_vertices(vademecum, cloud))
 
 
@@ -71,7 +75,7 @@ _Part = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def _first_blocks(field: BlockField, n_blocks: int) -> _Part:
-    """space, core, level and start of the first blocks of a field."""
+    """Return space, core, level and start of the first blocks of a field."""
     start = field.start[:, : n_blocks + 1]
     if n_blocks + 1 == field.start.shape[1]:
         return field.space, field.core, field.level, start
@@ -82,7 +86,7 @@ def _first_blocks(field: BlockField, n_blocks: int) -> _Part:
 
 
 def _joined(parts: list[_Part]) -> _Part:
-    """The blocks of all fields; of all but the first, those of global modes are left out."""
+    """Return the blocks of all fields; of all but the first, those of global modes are left out."""
     if len(parts) == 1:
         space, core, level, start = parts[0]
         return space, np.ascontiguousarray(core), level, np.ascontiguousarray(start)

@@ -81,7 +81,7 @@ RESUMED = ("passage", "seen", "active", "force", "before", "jaw")  # by another 
 
 
 def at_rest(model: Any) -> Any:
-    """The arrays of an organ at rest that no tool has touched, a tuple of DATA.
+    """Return the arrays of an organ at rest that no tool has touched, a tuple of DATA.
 
     model : a tuple of MODEL
     """

@@ -43,7 +43,7 @@ def display_arrays(
     positions: np.ndarray,
     patch_radius: float,
 ) -> Any:
-    """Corners and weights of the displayed vertices, a tuple of DISPLAY.
+    """Return the corners and weights of the displayed vertices, a tuple of DISPLAY.
 
     vertex : of the mesh, in each place of the blocks; -1 where a block is not full
     place : of each vertex in the blocks
@@ -62,7 +62,8 @@ def display_arrays(
 @fast
 def write_cloud(model, data):  # type: ignore[no-untyped-def]
     """The cloud, from what the modes displace in ``data.field``: with the dents of tips, at the
-    displayed vertices if they are not the mesh's."""
+    displayed vertices if they are not the mesh's.
+    """
     cloud, dents, shown = data.out.cloud, model.dent, model.display
     flat = cloud.reshape(6 * cloud.shape[0])
     if not model.display.on:

@@ -17,14 +17,15 @@ _SHELL = 5e-3  # below and above the surface, in which the compliance is sampled
 
 
 def force_error_at(vademecum: Vademecum, points: np.ndarray) -> np.ndarray:
-    """Relative error of the force that one contact in ten exceeds, shape (n,).
+    """Return the relative error of the force that one contact in ten exceeds, shape (n,).
 
     As :class:`avatar_core.vademecum.force_error.ForceError` estimates it; NaN off the accessible
     surface, and everywhere if the vademecum was not measured.
 
     Parameters
     ----------
-    points : ndarray, shape (n, 3), of the surface at rest [m]
+    points : ndarray, shape (n, 3)
+        Points of the surface at rest [m].
     """
     field, surface = vademecum.tip_field, vademecum.surface
     load = vademecum.contact_load.reshape(surface.n_positions, 3, -1)
@@ -38,7 +39,7 @@ def force_error_at(vademecum: Vademecum, points: np.ndarray) -> np.ndarray:
 
 
 def is_reached(vademecum: Vademecum, points: np.ndarray) -> np.ndarray:
-    """Whether points (n, 3) [m] lie on the surface that tools reach, shape (n,)."""
+    """Return whether points (n, 3) [m] lie on the surface that tools reach, shape (n,)."""
     field, surface = vademecum.tip_field, vademecum.surface
     access = map_coordinates(
         field.access.astype(float), _in_spacings(field, points), order=1, mode="nearest"
@@ -50,5 +51,5 @@ def is_reached(vademecum: Vademecum, points: np.ndarray) -> np.ndarray:
 
 
 def _in_spacings(field: TipField, points: np.ndarray) -> np.ndarray:
-    """Coordinates on the grid of a tip field, shape (3, n)."""
+    """Return the coordinates on the grid of a tip field, shape (3, n)."""
     return np.asarray(((np.asarray(points, float) - field.origin) / field.spacing[0]).T)

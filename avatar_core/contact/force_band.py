@@ -69,12 +69,16 @@ class ForceBand:
 
     Parameters
     ----------
-    data : ContactData of that loop
-    ratio : ndarray float32, shape (n_tools, n_positions, n_depths, 2), ln of the low and the high
-        edge over the force
-    depth : ndarray, shape (n_depths,), n_depths >= 2, rising by a constant factor [m]
+    data : ContactData
+        ContactData of that loop.
+    ratio : ndarray
+        float32, shape (n_tools, n_positions, n_depths, 2), ln of the low and the high edge over the
+        force.
+    depth : ndarray, shape (n_depths,)
+        n_depths >= 2, rising by a constant factor [m].
 
-    edges : ndarray, shape (2, n_tools, 6), force [N] and torque [N m] of both edges, low first
+    edges : ndarray, shape (2, n_tools, 6)
+        Force [N] and torque [N m] of both edges, low first.
     """
 
     def __init__(self, data: ContactData, ratio: np.ndarray, depth: np.ndarray) -> None:
@@ -84,7 +88,7 @@ class ForceBand:
 
     @staticmethod
     def of(data: ContactData, arrays: Mapping[str, np.ndarray]) -> ForceBand | None:
-        """The band of a loop, if its arrays were prepared."""
+        """Return the band of a loop, if its arrays were prepared."""
         return ForceBand(data, arrays[RATIO], arrays[DEPTH]) if RATIO in arrays else None
 
     def update(self) -> None:

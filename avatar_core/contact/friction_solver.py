@@ -129,7 +129,7 @@ def _add_tangential_dent(model, data, t):  # type: ignore[no-untyped-def]
 
 @inlined
 def _set_offset(model, data, t):  # type: ignore[no-untyped-def]
-    """y = c - s_a, the anchor first moved by the tool's rotation."""
+    """Return y = c - s_a, the anchor first moved by the tool's rotation."""
     friction = data.friction
     n, r, spin = data.normal[t], model.tip_offset[t], data.spin[t]
     if friction.motion[t] != NONE:
@@ -199,7 +199,7 @@ def _update_normal(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def _update_tangential(model, data, t):  # type: ignore[no-untyped-def]
-    """tau <- tau + (y - U)_t / c_t, projected to |tau| <= mu lambda."""
+    """Return tau <- tau + (y - U)_t / c_t, projected to |tau| <= mu lambda."""
     friction = data.friction
     n, c, g, y = (data.normal[t], friction.compliance[t, t], friction.push[t], friction.offset[t])
     u0, u1, u2 = patch_displacement(model, data, t)
@@ -260,7 +260,7 @@ def _slide_anchor(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def target_derivative(model, data, t, d):  # type: ignore[no-untyped-def]
-    """g . d(target)/dp_d of U = y + n (gap - n . y), y = p - r n - s_a.
+    """Return g . d(target)/dp_d of U = y + n (gap - n . y), y = p - r n - s_a.
 
     The dent's own tangential displacement, give tau, turns with n: - give lambda tau . dn/dp_d.
     """

@@ -93,9 +93,14 @@ MODEL = kind(
 class Shape:
     """Shape of the organ and the tips in a layout, whatever the organ is made of.
 
-    carriers : TipCarriers, load positions that carry a tip
-    reach : longest distance between the two positions of a block [m]
-    factor : of each tip
+    Attributes
+    ----------
+    carriers : TipCarriers
+        Load positions that carry a tip.
+    reach : float
+        Longest distance between the two positions of a block [m].
+    factor : ShapeFactor
+        Factor of each tip.
     """
 
     carriers: TipCarriers
@@ -126,11 +131,16 @@ def lay_out(
     period: float = PERIOD,
     shape: Shape | None = None,
 ) -> Any:
-    """The arrays of a contact model, a tuple of MODEL; see
-    :func:`avatar_core.contact.model.model_of`.
+    """Return the arrays of a contact model, a tuple of MODEL.
 
-    detail : of the displacement; by default all modes at the surface
-    shape : of the organ and the tips, if it is known
+    See :func:`avatar_core.contact.model.model_of`.
+
+    Parameters
+    ----------
+    detail : Detail or None
+        Detail of the displacement; by default all modes at the surface.
+    shape : Shape or None
+        Shape of the organ and the tips, if it is known.
     """
     detail = detail or Detail(vademecum.n_modes)
     chosen = default_effects(vademecum, tips) if effects is None else effects
@@ -207,7 +217,7 @@ def lay_out(
 
 
 def default_effects(vademecum: Vademecum, tips: Sequence[Tip]) -> tuple[Effect, ...]:
-    """Effects of a scene that names none: those that the vademecum and the tools require."""
+    """Return effects of a scene that names none: those that the vademecum and the tools require."""
     effects: list[Effect] = []
     if vademecum.large is not None:
         effects.append(LargeDeformationEffect())
@@ -221,7 +231,7 @@ def default_effects(vademecum: Vademecum, tips: Sequence[Tip]) -> tuple[Effect, 
 
 
 def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:
-    """E* and c on the grid of the tip field, shape (2, nx, ny, nz) float32.
+    """Return E* and c on the grid of the tip field, shape (2, nx, ny, nz) float32.
 
     Over a tumour of contrast q that stores the fraction f of the energy under a tip, E* is that of
     the organ over 1 - f + f / q.
@@ -239,7 +249,7 @@ def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:
 def force_error_grid(
     certificate: Certificate | None, large: LargeDeformation | None, smoothing: np.ndarray
 ) -> np.ndarray:
-    """The relative error of the force on the grid of the tip field; NaN if it is not known.
+    """Return the relative error of the force on the grid of the tip field; NaN if it is not known.
 
     smoothing : of :class:`avatar_core.contact.organ_response.TipResponse`, or values of it
     """
@@ -250,7 +260,7 @@ def force_error_grid(
 
 
 def _padded(load: np.ndarray) -> np.ndarray:
-    """The loads with zeros up to a multiple of ``LANES`` modes."""
+    """Return the loads with zeros up to a multiple of ``LANES`` modes."""
     return np.pad(load, ((0, 0), (0, 0), (0, -load.shape[2] % LANES)))
 
 

@@ -79,7 +79,7 @@ def _is_continuous(data, t, tip):  # type: ignore[no-untyped-def]
 
 @inlined
 def _set_normal(data, t, p, phi):  # type: ignore[no-untyped-def]
-    """n = g / |g| with g = grad phi, and s = p - phi n."""
+    """Return n = g / |g| with g = grad phi, and s = p - phi n."""
     g = data.slope[t]
     data.steepness[t] = max(np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2), 1e-3)
     for d in range(3):

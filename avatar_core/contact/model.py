@@ -50,7 +50,7 @@ def compiled_step() -> _Compiled:
 
 
 def compiled_for(kernel: Any, *types: Any) -> Any:
-    """A kernel compiled for numba types, called without numba's look-up of these."""
+    """Return a kernel compiled for numba types, called without numba's look-up of these."""
     kernel.compile(types)
     return kernel.get_overload(types)
 
@@ -161,12 +161,17 @@ def model_of(
     Parameters
     ----------
     vademecum : Vademecum
-    tips : the tip of each tool
-    modes : of the *displacement*, as in :class:`avatar_core.vademecum.accuracy.Detail`; None for
+    tips : Sequence[Tip]
+        The tip of each tool.
+    modes : int or None
+        Modes of the *displacement*, as in :class:`avatar_core.vademecum.accuracy.Detail`; None for
         all. Fewer modes leave the force exact, since the contact compliance keeps all of its own.
-    cloud : "surface" or "volume" vertices, or "off"
-    effects : to simulate; by default those that the vademecum and the tools require
-    period : of the steps [s], for effects that depend on time
+    cloud : Cloud
+        "surface" or "volume" vertices, or "off".
+    effects : Sequence[Effect] or None
+        Effects to simulate; by default those that the vademecum and the tools require.
+    period : float
+        Period of the steps [s], for effects that depend on time.
 
     Raises
     ------

@@ -80,7 +80,7 @@ def tip_carriers(surface: LoadSurface, field: TipField, depth: float, height: fl
 
 
 def field_at(field: TipField, points: np.ndarray) -> np.ndarray:
-    """phi at points of its grid, shape (n,) [m]."""
+    """Return phi at points of its grid, shape (n,) [m]."""
     value = np.empty(len(points))
     evaluate_all(
         field.distance, field.origin, field.spacing[0], points, value, np.empty_like(points)
@@ -142,7 +142,7 @@ def _taking(values: np.ndarray) -> np.ndarray:
 def sampled_at_tip(
     surface: LoadSurface, field: TipField, response: TipResponse, values: np.ndarray
 ) -> np.ndarray:
-    """Values at the load positions (n, n_positions), interpolated to the grid as gamma is.
+    """Return values at the load positions (n, n_positions), interpolated to the grid as gamma is.
 
     Returns
     -------
@@ -173,7 +173,7 @@ def closest_weights(surface: LoadSurface, points: np.ndarray) -> tuple[np.ndarra
 
 
 def _dilated(mask: np.ndarray, steps: int = 3) -> np.ndarray:
-    """The mask and all grid points within some steps, diagonals included."""
+    """Return the mask and all grid points within some steps, diagonals included."""
     for axis in range(3):
         source = np.moveaxis(mask, axis, 0)
         grown = source.copy()
@@ -348,7 +348,7 @@ def assemble_own(model, data, t, near):  # type: ignore[no-untyped-def]
 
 @fast
 def near_along_normal(data, t, column):  # type: ignore[no-untyped-def]
-    """n . sum_j w_j u_j over the nodes of a tip."""
+    """Return n . sum_j w_j u_j over the nodes of a tip."""
     n, near = data.normal[t], 0.0
     for i in range(data.n_nodes[t]):
         u = column[i]

@@ -16,8 +16,10 @@ _KNOWN = 0.5  # of a quaternion's square, 1 if there is an orientation
 
 
 def composed(frame: Any, orientation: Any) -> tuple[Any, Any, Any, Any]:
-    """An orientation, given in a frame, where that frame's is given: quaternions x y z w, of
-    numbers or of arrays. Real-time safe."""
+    """Return an orientation, given in an inner frame, in the outer one. Real-time safe.
+
+    Orientations are quaternions x y z w, of numbers or of arrays.
+    """
     i, j, k, w = frame
     x, y, z, s = orientation
     return (

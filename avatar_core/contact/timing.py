@@ -29,7 +29,7 @@ def timed(
     curve: AccuracyCurve,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> AccuracyCurve:
-    """The same curve with the processor's time of steps on this machine, one tool 5 mm deep.
+    """Return the same curve with the processor's time of steps on this machine, one tool 5 mm deep.
 
     Each point has the median over rounds of its p50 and p99. All points take their turn in a round,
     so that a neighbour who disturbs this machine's memory for a second disturbs one round of each,

@@ -89,7 +89,7 @@ def solve_tip(model, data, t, depth, compliance):  # type: ignore[no-untyped-def
 
 @fast
 def evaluate_tip(model, data, t):  # type: ignore[no-untyped-def]
-    """delta + eta - c e at the present force, and its derivative by the force."""
+    """Return delta + eta - c e at the present force, and its derivative by the force."""
     law = data.law
     gain = data.superposition.near_gain[0] if model.superposed[0] else 1.0
     elastic = gain * (data.force[t] - held_load(model, data, t))
@@ -152,7 +152,8 @@ def add_tip_force(model, data, t):  # type: ignore[no-untyped-def]
 @entry
 def loads_at_depths(model, data, softness, depth, load):  # type: ignore[no-untyped-def]
     """F / E* [m^2] of the first tip at depths [m], over an organ that gives way by ``softness``
-    F / E* beside the dent, E* (gamma - c) [1/m]; all (n,), the last is written."""
+    F / E* beside the dent, E* (gamma - c) [1/m]; all (n,), the last is written.
+    """
     for i in range(len(load)):
         data.law.place[0] = 0.0
         _find_place(model, data, 0, 1.0, softness[i], depth[i])

@@ -49,7 +49,7 @@ def starts_apart(vademecum: Vademecum, n: int) -> list[int]:
 def palpation(
     vademecum: Vademecum, radius: float, depth: float, n: int, position: int | None = None
 ) -> np.ndarray:
-    """A push along the inward normal and back out, shape (n, 3) [m]; starts 2 mm above."""
+    """Return a push along the inward normal and back out, shape (n, 3) [m]; starts 2 mm above."""
     surface = vademecum.surface
     j = middle_of_access(vademecum) if position is None else position
     t = np.linspace(0.0, 1.0, n)
@@ -66,15 +66,17 @@ def slide(
     heading: tuple[float, float, float] = (1.0, 0.0, 0.0),
     position: int | None = None,
 ) -> np.ndarray:
-    """A slide at constant depth over the accessible surface, shape (n, 3) [m].
+    """Return a slide at constant depth over the accessible surface, shape (n, 3) [m].
 
     The centre keeps phi = radius - depth and heads along ``heading``; it turns back where the
     access fades, so that any length can be travelled.
 
     Parameters
     ----------
-    radius, depth : of the tip and of its penetration of the surface at rest [m]
-    length, step : travelled and between periods [m]
+    radius, depth : float
+        Radius and depth of the tip and of its penetration of the surface at rest [m].
+    length, step : float
+        Travelled and between periods [m].
 
     Raises
     ------
@@ -102,7 +104,10 @@ def push_and_slide(
 ) -> np.ndarray:
     """A push and retreat, then a slide, shape (n, 3) [m]: a third and two thirds of the steps.
 
-    push, depth : of the push and of the slide [m]
+    Parameters
+    ----------
+    push, depth : float
+        Push and depth of the push and of the slide [m].
     """
     third = n // 3
     way_in = palpation(vademecum, radius, depth, third, position)[: third // 2]
@@ -135,5 +140,5 @@ def _at_level(field: TipField, p: np.ndarray, level: float) -> np.ndarray:
 
 
 def access(field: TipField, p: np.ndarray) -> float:
-    """chi at p: one where a tip may touch."""
+    """Return chi at p: one where a tip may touch."""
     return float(evaluate(field.access, field.origin, field.spacing[0], p, np.zeros(3), 0.0))

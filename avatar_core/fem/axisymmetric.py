@@ -30,15 +30,19 @@ class AxisymmetricBody:
 
     Parameters
     ----------
-    ticks : ndarray, rising from 0, of the edges of the elements along r and along -z
+    ticks : ndarray
+        Rising from 0, of the edges of the elements along r and along -z.
     material : HyperelasticMaterial
 
     Attributes
     ----------
-    places : ndarray, shape (n_nodes, 2), r and z of the nodes
-    free : ndarray, degrees of freedom that clamp and axis leave
-    top, top_shape, top_radius, top_area : of the surface z = 0: nodes (n_edges, 9), values of their
-        shape functions (n_edges, n_points, 9), r and 2 pi r dr (n_edges, n_points)
+    places : ndarray, shape (n_nodes, 2)
+        r and z of the nodes.
+    free : ndarray
+        Degrees of freedom that clamp and axis leave.
+    top, top_shape, top_radius, top_area
+        Top, top shape, top radius and top area of the surface z = 0: nodes (n_edges, 9), values of
+        their shape functions (n_edges, n_points, 9), r and 2 pi r dr (n_edges, n_points).
     """
 
     def __init__(self, ticks: np.ndarray, material: HyperelasticMaterial) -> None:
@@ -66,33 +70,33 @@ class AxisymmetricBody:
         return len(self.places)
 
     def deformation_gradient(self, u: np.ndarray) -> np.ndarray:
-        """F, shape (n_elements, 9, 3, 3)."""
+        """Return the f, shape (n_elements, 9, 3, 3)."""
         local = u[self.nodes].reshape(len(self.nodes), -1)
         F = np.zeros((*self.volume.shape, 3, 3))
         F[..., _ROW, _COLUMN] = np.einsum("eqak,ea->eqk", self._strain, local)
         return F + np.eye(3)
 
     def min_det(self, u: np.ndarray) -> float:
-        """Least det F over the quadrature points."""
+        """Return the least det F over the quadrature points."""
         return float(determinant(self.deformation_gradient(u)).min())
 
     def energy(self, u: np.ndarray) -> float:
-        """int psi 2 pi r dr dz."""
+        """Return int psi 2 pi r dr dz."""
         return float((self.volume * self.material.energy(self.deformation_gradient(u))).sum())
 
     def forces(self, u: np.ndarray) -> np.ndarray:
-        """Internal forces, the derivative of the energy."""
+        """Return the internal forces, the derivative of the energy."""
         stress = self.material.stress(self.deformation_gradient(u))[..., _ROW, _COLUMN]
         return self.gathered(
             self.nodes, np.einsum("eqak,eqk,eq->ea", self._strain, stress, self.volume)
         )
 
     def gathered(self, nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Sum of the forces at the nodes of elements or edges, shape (2 n_nodes,)."""
+        """Return the sum of the forces at the nodes of elements or edges, shape (2 n_nodes,)."""
         return np.bincount(_dofs(nodes).ravel(), values.ravel(), 2 * self.n_nodes)
 
     def factorize(self, u: np.ndarray, surface: np.ndarray) -> rslab.Ldlt:
-        """LDL^T of the tangent over the free dofs.
+        """Return LDL^T of the tangent over the free dofs.
 
         Parameters
         ----------
@@ -124,7 +128,7 @@ class AxisymmetricBody:
 
 
 def _dofs(nodes: np.ndarray) -> np.ndarray:
-    """(..., n, 2), those of u_r and u_z of each node."""
+    """Return (..., n, 2), those of u_r and u_z of each node."""
     return 2 * nodes[..., None] + np.arange(2)
 
 

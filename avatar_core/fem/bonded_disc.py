@@ -24,9 +24,14 @@ _BATCH = 60  # loads solved at once
 class BondedDisc:
     """Stiffness of a disc against rigid translations, and the organ's displacement by them.
 
-    stiffness : ndarray, shape (3, 3) [N/m], force on the organ by displacement of the disc
-    displacement : ndarray, shape (n_vertices, 3, 3) [-], of each vertex by each translation
-    n_nodes : of the disc
+    Attributes
+    ----------
+    stiffness : ndarray, shape (3, 3)
+        Stiffness [N/m], force on the organ by displacement of the disc.
+    displacement : ndarray, shape (n_vertices, 3, 3)
+        Displacement [-], of each vertex by each translation.
+    n_nodes : int
+        n nodes of the disc.
     """
 
     stiffness: FloatArray
@@ -37,13 +42,16 @@ class BondedDisc:
 def bonded_disc(
     elasticity: Elasticity, place: FloatArray, normal: FloatArray, radius: float
 ) -> BondedDisc:
-    """The disc around a place of the surface.
+    """Return the disc around a place of the surface.
 
     Parameters
     ----------
-    elasticity : the organ, refined there
-    place, normal : ndarray, shape (3,) [m], of the surface
-    radius : [m], along the surface
+    elasticity : Elasticity
+        The organ, refined there.
+    place, normal : ndarray, shape (3,)
+        Place and normal [m], of the surface.
+    radius : float
+        Radius [m], along the surface.
 
     Raises
     ------
@@ -76,7 +84,7 @@ def bonded_disc(
 
 
 def surface_nodes(elasticity: Elasticity) -> tuple[FloatArray, FloatArray]:
-    """Nodes of the surface, and where they are (n, 3) [m]."""
+    """Return the nodes of the surface, and where they are (n, 3) [m]."""
     mesh, of_faces = elasticity.mesh, elasticity.face_nodes
     corners = mesh.vertices[mesh.boundary_faces]
     middles = (corners + np.roll(corners, -1, axis=1)) / 2.0

@@ -100,8 +100,12 @@ def factors_at(
 class Inclusion:
     """A part of the organ with another stiffness and the same Poisson's ratio.
 
-    volume_fraction : ndarray, shape (n_tets,), chi, of each tetrahedron inside
-    contrast : Young's modulus inside over that outside, c > 0
+    Attributes
+    ----------
+    volume_fraction : ndarray, shape (n_tets,)
+        Chi, of each tetrahedron inside.
+    contrast : float
+        Young's modulus inside over that outside, c > 0.
     """
 
     volume_fraction: np.ndarray
@@ -124,12 +128,17 @@ class Elasticity:
     ----------
     mesh : TetMesh
     material : Material
-    clamped : ndarray of bool, shape (n_faces,), over ``mesh.boundary_faces``; all False and no
-        supports leave the organ free: then only :attr:`stiffness` can be used.
-    element : "P1", "P2", "Taylor-Hood" or None for ``material.element``
-    inclusion : Inclusion or None; not with Taylor-Hood
-    supports : springs beside the clamp; where two overlap, both act
-    resection : how far the cut of the mesh is opened; None for a mesh without one
+    clamped : ndarray of bool, shape (n_faces,)
+        Over ``mesh.boundary_faces``; all False and no supports leave the organ free: then only
+        :attr:`stiffness` can be used.
+    element : Element or None
+        "P1", "P2", "Taylor-Hood" or None for ``material.element``.
+    inclusion : Inclusion or None
+        Inclusion or None; not with Taylor-Hood.
+    supports : Sequence[Support]
+        Springs beside the clamp; where two overlap, both act.
+    resection : Resection or None
+        How far the cut of the mesh is opened; None for a mesh without one.
 
     Raises
     ------
@@ -203,10 +212,14 @@ class Elasticity:
         stiffness: Mapping[str, float] | None = None,
         opened: float | None = None,
     ) -> Elasticity:
-        """The same problem and element at other values; matrices are shared.
+        """Return the same problem and element at other values; matrices are shared.
 
-        stiffness : of supports, by name [N/m^3]; those not given keep theirs
-        opened : of the cut, 0 to 1
+        Parameters
+        ----------
+        stiffness : Mapping[str, float] or None
+            Stiffness of supports, by name [N/m^3]; those not given keep theirs.
+        opened : float or None
+            Opened of the cut, 0 to 1.
         """
         other = copy(self)
         other.material = material
@@ -255,7 +268,7 @@ class Elasticity:
         return sum((stiffness * mass for stiffness, mass in springs), shear).tocsr()
 
     def apply_term(self, q: int, displacement: np.ndarray) -> np.ndarray:
-        """K_q u of one of :attr:`factors`, shape (3 n_nodes, n) [m^2], of springs [m^3]."""
+        """Return K_q u of one of :attr:`factors`, shape (3 n_nodes, n) [m^2], of springs [m^3]."""
         if q >= self.n_material:
             return np.asarray(self._terms.spring_mass[q - self.n_material] @ displacement)
         if self.element != "Taylor-Hood":
@@ -334,12 +347,14 @@ class Elasticity:
         return 12 * int(self._factor.factor_nnz)  # a value and its part of an index
 
     def solve(self, loads: np.ndarray | sp.spmatrix, single: bool = False) -> np.ndarray:
-        """Displacements u = K^-1 f under nodal forces, zero at the clamp.
+        """Return the displacements u = K^-1 f under nodal forces, zero at the clamp.
 
         Parameters
         ----------
-        loads : ndarray or sparse, shape (3 n_nodes, n) [N]
-        single : in single precision, which takes half the time; see :meth:`single_error`
+        loads : ndarray or sp.spmatrix, shape (3 n_nodes, n)
+            Ndarray or sparse [N].
+        single : bool
+            Single in single precision, which takes half the time; see :meth:`single_error`.
 
         Returns
         -------
@@ -377,7 +392,7 @@ class Elasticity:
         return displacement
 
     def refining(self) -> Elasticity:
-        """The same problem, solved in double precision by the factor in single precision.
+        """Return the same problem, solved in double precision by the factor in single precision.
 
         Each solution is refined by those for what it leaves (Langou et al., Proc. SC 2006): two or
         three solutions in single precision instead of one in double, and no factor in double, which
@@ -390,7 +405,7 @@ class Elasticity:
         return other
 
     def _refined(self, loads: np.ndarray) -> np.ndarray | None:
-        """Solutions by refinement; None where it does not converge."""
+        """Return the solutions by refinement; None where it does not converge."""
         found, left, before = np.zeros(loads.shape), loads, np.inf
         while True:
             change = self.solve(left, single=True)
@@ -403,7 +418,7 @@ class Elasticity:
             before, left = moved, loads - self.apply(found)
 
     def single_error(self, loads: sp.spmatrix) -> float:
-        """Relative error of solutions in single precision, the largest of some loads.
+        """Return the relative error of solutions in single precision, the largest of some loads.
 
         As one step of refinement finds it: the solution for what they leave, in double precision.
         P2 has 1e-4 at nu = 0.48 and 7e-4 at 0.49, Taylor-Hood 5e-5 at 0.495.
@@ -418,19 +433,19 @@ class Elasticity:
         return self.single_error(loads.tocsc()[:, :_TRIED]) < SINGLE_ERROR
 
     def apply(self, displacement: np.ndarray) -> np.ndarray:
-        """Internal forces K u, shape (3 n_nodes, n) [N]; reactions appear at the clamp."""
+        """Return internal forces K u, shape (3 n_nodes, n) [N]; reactions appear at the clamp."""
         if self.element != "Taylor-Hood":
             return self.stiffness @ displacement
         terms = enumerate(self.factors)
         return np.asarray(sum(theta * self.apply_term(q, displacement) for q, theta in terms))
 
     def at_vertices(self, displacement: np.ndarray) -> np.ndarray:
-        """The vertex part of nodal displacements, shape (3 n_vertices, n)."""
+        """Return the vertex part of nodal displacements, shape (3 n_vertices, n)."""
         return displacement[: 3 * len(self.mesh.vertices)]
 
 
 def _contains(triangle: np.ndarray, point: np.ndarray) -> bool:
-    """Whether a point of the triangle's plane lies in it, with a little slack."""
+    """Return whether a point of the triangle's plane lies in it, with a little slack."""
     edges = (triangle[1] - triangle[0], triangle[2] - triangle[0])
     weight = np.linalg.lstsq(np.stack(edges, axis=1), point - triangle[0], rcond=None)[0]
     gap = point - triangle[0] - weight @ np.stack(edges)

@@ -32,23 +32,26 @@ _HALVINGS = 50  # to where such a ray leaves the sector
 
 
 def ring_radii() -> np.ndarray:
-    """Radii of the middle of each ring over that of the outermost, shape (RINGS,)."""
+    """Return the radii of the middle of each ring over that of the outermost, shape (RINGS,)."""
     return (np.arange(RINGS) + 0.5) / RINGS
 
 
 def sector_angles() -> np.ndarray:
-    """Angles of the middle of each sector, shape (SECTORS,)."""
+    """Return the angles of the middle of each sector, shape (SECTORS,)."""
     return 2.0 * np.pi * np.arange(SECTORS) / SECTORS
 
 
 def loads_on_heights(under: np.ndarray, window: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """F / E* on tips, shape (n,) [m^2].
+    """Return F / E* on tips, shape (n,) [m^2].
 
     Parameters
     ----------
-    under : ndarray, shape (n, RINGS), f - d at the middles of the rings [m]
-    window : ndarray, shape (n,), outer radius of the rings [m]: the tip touches inside
-    height : ndarray, shape (n, RINGS, SECTORS), H at the middles of the sectors [m]
+    under : ndarray, shape (n, RINGS)
+        f - d at the middles of the rings [m].
+    window : ndarray, shape (n,)
+        Outer radius of the rings [m]: the tip touches inside.
+    height : ndarray, shape (n, RINGS, SECTORS)
+        H at the middles of the sectors [m].
     """
     gap = (under[:, :, None] + height).reshape(len(under), RINGS * SECTORS) / window[:, None]
     step, weight, largest = _problem()
@@ -59,7 +62,7 @@ def loads_on_heights(under: np.ndarray, window: np.ndarray, height: np.ndarray) 
 
 @cache
 def _problem() -> tuple[np.ndarray, np.ndarray, float]:
-    """I - A / L, area over scale, and L, the largest eigenvalue of A.
+    """Return I - A / L, area over scale, and L, the largest eigenvalue of A.
 
     A : energies of pressures of unit energy, the scale, with lengths in units of the window's
         radius and E* = 1
@@ -124,7 +127,7 @@ def _influence() -> np.ndarray:
 
 
 def _over_sector(ring: int, middle: float, at: float) -> float:
-    """int dA / |x - x'| over a sector, x' at (at, 0)."""
+    """Return int dA / |x - x'| over a sector, x' at (at, 0)."""
     inner, outer, half = ring / RINGS, (ring + 1) / RINGS, np.pi / SECTORS
     centre = 0.5 * (inner + outer)
     away = np.hypot(centre * np.cos(middle) - at, centre * np.sin(middle))
@@ -141,7 +144,7 @@ def _over_sector(ring: int, middle: float, at: float) -> float:
 
 
 def _over_own(inner: float, outer: float, half: float, at: float) -> float:
-    """The same over the sector around x': its length along all rays from there."""
+    """Return the same over the sector around x': its length along all rays from there."""
     ray = 2.0 * np.pi * (np.arange(_RAYS) + 0.5) / _RAYS
     low, high = np.zeros(_RAYS), np.full(_RAYS, 2.0 * outer)
     for _ in range(_HALVINGS):

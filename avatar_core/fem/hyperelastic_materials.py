@@ -27,13 +27,13 @@ class HyperelasticMaterial(Protocol):
         """The material at small strain."""
 
     def energy(self, F: np.ndarray) -> np.ndarray:
-        """psi(F), shape (...,) [J/m^3]; zero at F = I."""
+        """Return psi(F), shape (...,) [J/m^3]; zero at F = I."""
 
     def stress(self, F: np.ndarray) -> np.ndarray:
-        """P_iJ = d psi / d F_iJ, shape (..., 3, 3) [Pa]."""
+        """Return P_iJ = d psi / d F_iJ, shape (..., 3, 3) [Pa]."""
 
     def tangent(self, F: np.ndarray) -> np.ndarray:
-        """A_iJkL = d P_iJ / d F_kL = A_kLiJ, shape (..., 3, 3, 3, 3) [Pa]."""
+        """Return A_iJkL = d P_iJ / d F_kL = A_kLiJ, shape (..., 3, 3, 3, 3) [Pa]."""
 
 
 @dataclass(frozen=True)
@@ -47,17 +47,17 @@ class StVenantKirchhoff:
     linear: Material = field(default_factory=Material)
 
     def energy(self, F: np.ndarray) -> np.ndarray:
-        """psi(F), shape (...,) [J/m^3]."""
+        """Return psi(F), shape (...,) [J/m^3]."""
         lam, mu = self.linear.lame
         E = _green(F)
         return 0.5 * lam * _trace(E) ** 2 + mu * np.einsum("...ij,...ij->...", E, E)
 
     def stress(self, F: np.ndarray) -> np.ndarray:
-        """P = F S with S = lambda tr(E) I + 2 mu E, shape (..., 3, 3) [Pa]."""
+        """Return P = F S with S = lambda tr(E) I + 2 mu E, shape (..., 3, 3) [Pa]."""
         return F @ self._second_piola(F)
 
     def tangent(self, F: np.ndarray) -> np.ndarray:
-        """Derivative of F S, shape (..., 3, 3, 3, 3) [Pa].
+        """Return the derivative of F S, shape (..., 3, 3, 3, 3) [Pa].
 
         A_iJkL = d_ik S_JL + lambda F_iJ F_kL + mu (F_iL F_kJ + (F F^T)_ik d_JL)
         """
@@ -83,21 +83,21 @@ class NeoHookean:
     linear: Material = field(default_factory=Material)
 
     def energy(self, F: np.ndarray) -> np.ndarray:
-        """psi(F), shape (...,) [J/m^3]."""
+        """Return psi(F), shape (...,) [J/m^3]."""
         lam, mu = self.linear.lame
         log_J = np.log(determinant(F))
         squared = np.einsum("...ij,...ij->...", F, F)
         return 0.5 * mu * (squared - 3.0) - mu * log_J + 0.5 * lam * log_J**2
 
     def stress(self, F: np.ndarray) -> np.ndarray:
-        """P = mu (F - F^-T) + lambda ln J F^-T, shape (..., 3, 3) [Pa]."""
+        """Return P = mu (F - F^-T) + lambda ln J F^-T, shape (..., 3, 3) [Pa]."""
         lam, mu = self.linear.lame
         J = determinant(F)
         pressure = lam * np.log(J) - mu
         return mu * F + (pressure / J)[..., None, None] * cofactor(F)
 
     def tangent(self, F: np.ndarray) -> np.ndarray:
-        """Derivative of the stress, H = F^-T, shape (..., 3, 3, 3, 3) [Pa].
+        """Return the derivative of the stress, H = F^-T, shape (..., 3, 3, 3, 3) [Pa].
 
         A_iJkL = mu d_ik d_JL + lambda H_iJ H_kL + (mu - lambda ln J) H_iL H_kJ
         """
@@ -111,13 +111,13 @@ class NeoHookean:
 
 
 def cofactor(F: np.ndarray) -> np.ndarray:
-    """J F^-T, whose rows are the cross products of the other two rows; shape (..., 3, 3)."""
+    """Return J F^-T, whose rows are the cross products of the other two rows; shape (..., 3, 3)."""
     a, b, c = F[..., 0, :], F[..., 1, :], F[..., 2, :]
     return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-2)
 
 
 def determinant(F: np.ndarray) -> np.ndarray:
-    """J = det F, the ratio of volumes; shape (...,)."""
+    """Return J = det F, the ratio of volumes; shape (...,)."""
     a, b, c = F[..., 0, :], F[..., 1, :], F[..., 2, :]
     return np.einsum("...i,...i->...", a, np.cross(b, c))
 
@@ -131,10 +131,10 @@ def _trace(E: np.ndarray) -> np.ndarray:
 
 
 def _outer(G: np.ndarray, H: np.ndarray) -> np.ndarray:
-    """G_iJ H_kL."""
+    """Return G_iJ H_kL."""
     return np.einsum("...ij,...kl->...ijkl", G, H)
 
 
 def _crossed(G: np.ndarray, H: np.ndarray) -> np.ndarray:
-    """G_iL H_kJ."""
+    """Return G_iL H_kJ."""
     return np.einsum("...il,...kj->...ijkl", G, H)

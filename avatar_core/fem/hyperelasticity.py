@@ -40,7 +40,8 @@ class Hyperelasticity:
     ----------
     mesh : TetMesh
     material : HyperelasticMaterial
-    clamped : ndarray of bool, shape (n_faces,), over ``mesh.boundary_faces``
+    clamped : ndarray of bool, shape (n_faces,)
+        Over ``mesh.boundary_faces``.
 
     Raises
     ------
@@ -79,7 +80,7 @@ class Hyperelasticity:
         return np.flatnonzero(free)
 
     def deformation_gradient(self, displacement: np.ndarray) -> np.ndarray:
-        """F = I + grad u at the quadrature points, shape (n_tets, 4, 3, 3)."""
+        """Return F = I + grad u at the quadrature points, shape (n_tets, 4, 3, 3)."""
         return self._deformation_gradient(displacement, self.gradients)
 
     def _deformation_gradient(self, displacement: np.ndarray, gradients: np.ndarray) -> np.ndarray:
@@ -93,7 +94,7 @@ class Hyperelasticity:
         return float(min(inside, determinant(corners).min()))
 
     def energy(self, displacement: np.ndarray) -> float:
-        """Stored energy int psi dx [J]; infinite where a quadrature point is inverted."""
+        """Return stored energy int psi dx [J]; infinite where a quadrature point is inverted."""
         F = self.deformation_gradient(displacement)
         if determinant(F).min() <= 0.0:
             return float("inf")
@@ -108,7 +109,7 @@ class Hyperelasticity:
         return np.bincount(dofs.ravel(), weights=local.ravel(), minlength=3 * self.n_nodes)
 
     def tangent(self, displacement: np.ndarray) -> sp.csc_matrix:
-        """Lower triangle of the stiffness d forces / du over the free dofs [N/m].
+        """Return the lower triangle of the stiffness d forces / du over the free dofs [N/m].
 
         The pattern, and the order of ``data``, is the same for every displacement.
         """

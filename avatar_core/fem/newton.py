@@ -43,11 +43,17 @@ _PREDICTED = 1e-2  # accuracy of the tangent that predicts the next state
 class NewtonRule:
     """When to stop, and how to step.
 
-    tolerance : of the residual over the load, 2-norms over the free degrees of freedom
-    max_iterations : of Newton's method in one load step
-    first_step, least_step : fractions of the whole load or depth
-    exact_stability : count the negative pivots at every state returned (a factorization each);
-        without it, instability is noticed only where the conjugate gradients meet it
+    Attributes
+    ----------
+    tolerance : float
+        Tolerance of the residual over the load, 2-norms over the free degrees of freedom.
+    max_iterations : int
+        Max iterations of Newton's method in one load step.
+    first_step, least_step : float
+        Fractions of the whole load or depth.
+    exact_stability : bool
+        Count the negative pivots at every state returned (a factorization each); without it,
+        instability is noticed only where the conjugate gradients meet it.
     """
 
     tolerance: float = 1e-6
@@ -61,12 +67,20 @@ class NewtonRule:
 class State:
     """One equilibrium.
 
-    displacement : ndarray, shape (3 n_nodes,) [m]
-    force : ndarray, shape (n_loads,), factors of the loads given; [N] for unit loads
-    depth : of the patch, for :func:`press` [m]
-    residuals : ndarray, shape (n_iterations + 1,), residual over load in the last load step
-    min_det : smallest det F over quadrature points and corners of the elements
-    newton_iterations : all that were made since the state before, load steps that failed included
+    Attributes
+    ----------
+    displacement : ndarray, shape (3 n_nodes,)
+        Displacement [m].
+    force : ndarray, shape (n_loads,)
+        Factors of the loads given; [N] for unit loads.
+    depth : float
+        Depth of the patch, for :func:`press` [m].
+    residuals : ndarray, shape (n_iterations + 1,)
+        Residual over load in the last load step.
+    min_det : float
+        Smallest det F over quadrature points and corners of the elements.
+    newton_iterations : int
+        All that were made since the state before, load steps that failed included.
     """
 
     displacement: np.ndarray
@@ -78,7 +92,7 @@ class State:
 
 
 def solve(problem: Hyperelasticity, load: np.ndarray, rule: NewtonRule | None = None) -> State:
-    """The equilibrium under a dead load, reached from rest by load steps.
+    """Return the equilibrium under a dead load, reached from rest by load steps.
 
     Parameters
     ----------
@@ -112,14 +126,19 @@ def press(
     Parameters
     ----------
     problem : Hyperelasticity
-    loads : ndarray, shape (3 n_nodes, m), C, unit loads of the patch: columns of ``patch_loads``,
-        or combinations of them. ``State.force`` are their factors [N].
-    motion : ndarray, shape (m,), n: C^T u = depth n
-    depths : increasing and positive [m]
-    rule : NewtonRule
-    preload : ndarray, shape (3 n_nodes,), a dead load such as weight, carried before and during
-        the push; depths count from there
-    progress : called with the fraction of the last depth that is reached, at every Newton iteration
+    loads : ndarray, shape (3 n_nodes, m)
+        C, unit loads of the patch: columns of ``patch_loads``, or combinations of them.
+        ``State.force`` are their factors [N].
+    motion : ndarray, shape (m,)
+        n: C^T u = depth n.
+    depths : Sequence[float]
+        Increasing and positive [m].
+    rule : NewtonRule or None
+        NewtonRule.
+    preload : ndarray, shape (3 n_nodes,)
+        A dead load such as weight, carried before and during the push; depths count from there.
+    progress : Callable[[float], None]
+        Called with the fraction of the last depth that is reached, at every Newton iteration.
 
     Raises
     ------
@@ -138,7 +157,7 @@ def press(
 
 
 def _free_load(problem: Hyperelasticity, load: np.ndarray) -> np.ndarray:
-    """The load on the free degrees of freedom, shape (n_free,) [N]."""
+    """Return the load on the free degrees of freedom, shape (n_free,) [N]."""
     if load.shape != (3 * problem.n_nodes,) or not np.isfinite(load).all():
         raise LoadError(
             f"the load has the shape {load.shape}; give {3 * problem.n_nodes} finite nodal forces, "
@@ -152,7 +171,7 @@ def _free_load(problem: Hyperelasticity, load: np.ndarray) -> np.ndarray:
 def _march(
     newton: _Newton, targets: list[float], progress: Callable[[float], None] = lambda fraction: None
 ) -> Iterator[State]:
-    """States at increasing targets of load factor or depth, in steps of adapted size."""
+    """Yield the states at increasing targets of load factor or depth, in steps of adapted size."""
     rule, whole = newton.rule, targets[-1]
     state, reached, step = newton.rest, 0.0, rule.first_step * whole
     stable, careful = (state, reached), False
@@ -219,11 +238,11 @@ class _Newton(ABC):
 
     @abstractmethod
     def _slope(self, u: np.ndarray) -> np.ndarray:
-        """du / d(coordinate) at an equilibrium, shape (n_free,)."""
+        """Return du / d(coordinate) at an equilibrium, shape (n_free,)."""
 
     @abstractmethod
     def _dead_load(self, aim: float) -> np.ndarray:
-        """The load that is given, shape (n_free,) [N]; zero where it is a multiplier."""
+        """Return the load that is given, shape (n_free,) [N]; zero where it is a multiplier."""
 
     def advance(self, state: State, aim: float) -> State:
         """The equilibrium at the next coordinate, from u + (aim - coordinate) du/d(coordinate)."""
@@ -242,7 +261,7 @@ class _Newton(ABC):
         return new
 
     def _state(self, u: np.ndarray, aim: float, residuals: list[float]) -> State:
-        """The state that was aimed at; multipliers replace the load factor."""
+        """Return the state that was aimed at; multipliers replace the load factor."""
         free, force, depth = self.problem.free, np.array([aim]), 0.0
         if self.held is not None:
             force, depth = self._multipliers(self.problem.forces(u)[free] - self.load), aim
@@ -259,7 +278,7 @@ class _Newton(ABC):
             raise _LostError(f"nothing resists {negative + zero} ways to deform it further")
 
     def _taken_by_constraint(self, factor: rslab.Ldlt) -> int:
-        """Negative directions that the constraint takes away: those of C^T K^-1 C."""
+        """Return the negative directions that the constraint takes away: those of C^T K^-1 C."""
         if self.held is None:
             return 0
         compliance = self.held.T @ factor.solve_many(np.asfortranarray(self.held))
@@ -279,14 +298,14 @@ class _Newton(ABC):
             self._unit_slopes = slope @ np.linalg.inv(self.held.T @ slope)
 
     def _precondition(self, residual: np.ndarray) -> np.ndarray:
-        """M^-1 r, without what would change C^T u."""
+        """Return M^-1 r, without what would change C^T u."""
         direction = self._factor.solve(residual)
         if self.held is not None:
             direction -= self._unit_slopes @ (self.held.T @ direction)
         return direction
 
     def _multipliers(self, gradient: np.ndarray) -> np.ndarray:
-        """The factors of the held loads that best balance a gradient, shape (m,)."""
+        """Return the factors of the held loads that best balance a gradient, shape (m,)."""
         assert self.held is not None
         return np.linalg.solve(self.held.T @ self.held, self.held.T @ gradient)
 
@@ -300,7 +319,7 @@ class _Newton(ABC):
         return gradient, float(np.linalg.norm(gradient) / np.linalg.norm(force))
 
     def _descend(self, u: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, list[float]]:
-        """Minimiser of Pi near u under the constraint, and the residuals on the way."""
+        """Return the minimiser of Pi near u under the constraint, and the residuals on the way."""
         gradient, residual = self._gradient(u, load)
         residuals = [residual]
         while not residual <= self.rule.tolerance:
@@ -337,7 +356,7 @@ class _Newton(ABC):
     def _direction(
         self, tangent: sp.csc_matrix, right: np.ndarray, forcing: float, enough: float = 0.0
     ) -> np.ndarray:
-        """K^-1 r in the free directions, by projected conjugate gradients.
+        """Return K^-1 r in the free directions, by projected conjugate gradients.
 
         After ``_MOST_INNER`` iterations the direction is inexact but still one of descent; the
         line search and the residual of Newton's method decide what it is worth.
@@ -383,7 +402,7 @@ class _LoadControl(_Newton):
         return aim * self.load
 
     def _slope(self, u: np.ndarray) -> np.ndarray:
-        """K^-1 f."""
+        """Return K^-1 f."""
         return self._direction(self.problem.tangent(u), self.load, _PREDICTED)
 
 
@@ -405,7 +424,7 @@ class _DepthControl(_Newton):
         return self.load
 
     def _slope(self, u: np.ndarray) -> np.ndarray:
-        """The s with C^T s = n of least s . K s."""
+        """Return the s with C^T s = n of least s . K s."""
         tangent = self.problem.tangent(u)
         start = self._unit_slopes @ self._motion
         force = _times(tangent, start)
@@ -415,5 +434,5 @@ class _DepthControl(_Newton):
 
 
 def _times(lower: sp.csc_matrix, vector: np.ndarray) -> np.ndarray:
-    """Product with a symmetric matrix of which the lower triangle is stored."""
+    """Return the product with a symmetric matrix of which the lower triangle is stored."""
     return lower @ vector + lower.T @ vector - lower.diagonal() * vector

@@ -13,12 +13,13 @@ from avatar_core.geometry.mesh import TetMesh
 
 
 def l2_norm(field: FloatArray, mass: FloatArray) -> NDArray[np.float64]:
-    """|u| of each column of a field.
+    """Return |u| of each column of a field.
 
     Parameters
     ----------
     field : ndarray, shape (n_dofs, ...)
-    mass : ndarray, shape (n_dofs,), :attr:`avatar_core.geometry.mesh.TetMesh.lumped_mass`
+    mass : ndarray, shape (n_dofs,)
+        :attr:`avatar_core.geometry.mesh.TetMesh.lumped_mass`.
 
     Returns
     -------
@@ -28,31 +29,35 @@ def l2_norm(field: FloatArray, mass: FloatArray) -> NDArray[np.float64]:
 
 
 def relative_l2(estimate: FloatArray, truth: FloatArray, mass: FloatArray) -> NDArray[np.float64]:
-    """|u - u_ref| / |u_ref| of each column; arguments as of :func:`l2_norm`."""
+    """Return |u - u_ref| / |u_ref| of each column; arguments as of :func:`l2_norm`."""
     return l2_norm(estimate - truth, mass) / l2_norm(truth, mass)
 
 
 def mean_strain(mesh: TetMesh, displacement: FloatArray) -> float:
-    """Root mean square of the strain |sym grad u| over an organ, (int |eps|^2 dx / V)^(1/2).
+    """Return root mean square of the strain |sym grad u| over an organ, (int |eps|^2 dx / V)^(1/2).
 
     Parameters
     ----------
-    displacement : ndarray, shape (n_vertices, 3) [m], linear in each tetrahedron
+    displacement : ndarray, shape (n_vertices, 3)
+        Displacement [m], linear in each tetrahedron.
     """
     gradient = _gradients(mesh, displacement)
     return _mean(mesh, (gradient + gradient.swapaxes(1, 2)) / 2.0)
 
 
 def mean_gradient(mesh: TetMesh, displacement: FloatArray) -> float:
-    """Root mean square of |grad u| over an organ, strain and rotation together.
+    """Return the root mean square of |grad u| over an organ, strain and rotation together.
 
-    displacement : as of :func:`mean_strain`
+    Parameters
+    ----------
+    displacement : ndarray
+        See :func:`mean_strain`.
     """
     return _mean(mesh, _gradients(mesh, displacement))
 
 
 def _gradients(mesh: TetMesh, displacement: FloatArray) -> FloatArray:
-    """grad u of each tetrahedron, shape (n_tets, 3, 3)."""
+    """Return grad u of each tetrahedron, shape (n_tets, 3, 3)."""
     at, moved = mesh.vertices[mesh.tets], displacement[mesh.tets]
     return np.asarray(np.linalg.solve(at[:, 1:] - at[:, :1], moved[:, 1:] - moved[:, :1]))
 
@@ -69,9 +74,12 @@ def require_orthonormal(
 
     Parameters
     ----------
-    functions : ndarray, shape (n, rank), X
-    images : ndarray, shape (n, m), A X' for the last m functions; A a stiffness or a mass
-    what : names the functions in the error
+    functions : ndarray, shape (n, rank)
+        X.
+    images : ndarray, shape (n, m)
+        A X' for the last m functions; A a stiffness or a mass.
+    what : str
+        Names the functions in the error.
 
     Raises
     ------

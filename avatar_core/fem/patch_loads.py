@@ -42,9 +42,14 @@ MOST_POSITIONS = 6000  # with midpoints; the contact near field grows with their
 class SurfacePoint:
     """A point of the accessible surface.
 
-    positions, weights : ndarray, shape (n,), the load positions that carry it
-    point : ndarray, shape (3,) [m]
-    normal : ndarray, shape (3,), unit outward normal of its patch
+    Attributes
+    ----------
+    positions, weights : ndarray, shape (n,)
+        The load positions that carry it.
+    point : ndarray, shape (3,)
+        Point [m].
+    normal : ndarray, shape (3,)
+        Unit outward normal of its patch.
     """
 
     positions: np.ndarray
@@ -57,12 +62,18 @@ class SurfacePoint:
 class LoadSurface:
     """The load positions of the accessible surface.
 
-    centers : ndarray, shape (n_positions, 3) [m], patch centres
-    normals : ndarray, shape (n_positions, 3), of the patches, :func:`patch_normals`
-    corners : ndarray of int, shape (n_triangles, 3), positions at the corners of each face
-    vertices : ndarray of int, shape (n_corners,), mesh vertex of the first positions; the others
-        are edge midpoints
-    patch_radius : R [m]
+    Attributes
+    ----------
+    centers : ndarray, shape (n_positions, 3)
+        Centers [m], patch centres.
+    normals : ndarray, shape (n_positions, 3)
+        Normals of the patches, :func:`patch_normals`.
+    corners : ndarray of int, shape (n_triangles, 3)
+        Positions at the corners of each face.
+    vertices : ndarray of int, shape (n_corners,)
+        Mesh vertex of the first positions; the others are edge midpoints.
+    patch_radius : float
+        R [m].
     """
 
     centers: np.ndarray
@@ -87,7 +98,10 @@ class LoadSurface:
         Parameters
         ----------
         values : ndarray, shape (n_positions,)
-        n : number of positions at most; distance : [m]
+        n : int
+            Number of positions at most.
+        distance : float
+            Distance [m].
 
         Returns
         -------
@@ -137,11 +151,12 @@ class LoadSurface:
         return positions, barycentric if positions.shape[1] == 3 else triangle_shape(barycentric)
 
     def nearest(self, point: ArrayLike) -> SurfacePoint:
-        """The point of the accessible surface nearest to a point in space.
+        """Return the point of the accessible surface nearest to a point in space.
 
         Parameters
         ----------
-        point : array_like, shape (3,) [m]
+        point : array_like, shape (3,)
+            Point [m].
 
         Raises
         ------
@@ -171,7 +186,7 @@ class LoadSurface:
 
 
 def default_patch_radius(mesh: TetMesh, regions: Regions) -> float:
-    """R = max(12 mm, 1.2 x mean edge of the accessible surface) [m]."""
+    """Return R = max(12 mm, 1.2 x mean edge of the accessible surface) [m]."""
     corners = mesh.vertices[mesh.boundary_faces[regions.accessible]]
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean()
     return max(LEAST_PATCH_RADIUS, 1.2 * float(edge))
@@ -223,14 +238,15 @@ def _open_faces(mesh: TetMesh, faces: np.ndarray, radius: float) -> np.ndarray:
 
 
 def patch_normals(mesh: TetMesh, centers: np.ndarray, radius: float) -> np.ndarray:
-    """Normals of patches: the mean surface normal within R, weighted like the traction.
+    """Return the normals of patches: the mean surface normal within R, weighted like the traction.
 
     n_s ~ int (1 - |x - s|^2 / R^2)^2 n da. It turns smoothly with s where the faces do not, which
     makes everything that depends on s smooth enough to be interpolated.
 
     Parameters
     ----------
-    centers : ndarray, shape (n, 3) [m]
+    centers : ndarray, shape (n, 3)
+        Centers [m].
 
     Returns
     -------
@@ -241,7 +257,7 @@ def patch_normals(mesh: TetMesh, centers: np.ndarray, radius: float) -> np.ndarr
 
 
 def patch_loads(elasticity: Elasticity, centers: np.ndarray, radius: float) -> sp.csr_matrix:
-    """Nodal forces of unit patch tractions in the three coordinate directions.
+    """Return the nodal forces of unit patch tractions in the three coordinate directions.
 
     Column ``3 i + d`` integrates psi_{s_i} e_d against the element's shape functions; its
     transpose averages: ``loads.T @ u`` is u_bar. The profile is normalized by its own quadrature,
@@ -250,8 +266,10 @@ def patch_loads(elasticity: Elasticity, centers: np.ndarray, radius: float) -> s
     Parameters
     ----------
     elasticity : Elasticity
-    centers : ndarray, shape (n, 3) [m]
-    radius : R [m]
+    centers : ndarray, shape (n, 3)
+        Centers [m].
+    radius : float
+        R [m].
 
     Returns
     -------
@@ -345,7 +363,7 @@ def scaled_gram(elasticity: Elasticity, loads: sp.spmatrix) -> sp.csr_matrix:
 
 
 def triples(positions: np.ndarray) -> np.ndarray:
-    """Numbers of the three loads of each position, shape (3 n,)."""
+    """Return the numbers of the three loads of each position, shape (3 n,)."""
     return np.asarray((3 * np.asarray(positions)[:, None] + np.arange(3)).ravel())
 
 

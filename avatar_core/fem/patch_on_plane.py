@@ -36,7 +36,7 @@ _LAST, _NODES = 60.0, 1200  # of the integral over x: [48 J_3 / x^3]^2 falls as 
 
 
 def patch_dent(rho: np.ndarray) -> np.ndarray:
-    """E* R_p / F u_patch at distances rho [R_p] on the surface of a half-space."""
+    """Return E* R_p / F u_patch at distances rho [R_p] on the surface of a half-space."""
     theta, weight = quarter_turn(_FINE)
     rho = np.asarray(rho, float)[..., None]
     end = np.minimum(rho, 1.0)
@@ -49,14 +49,14 @@ def patch_dent(rho: np.ndarray) -> np.ndarray:
 
 @cache
 def quarter_turn(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights of Gauss's rule over theta in [0, pi/2]."""
+    """Return the nodes and weights of Gauss's rule over theta in [0, pi/2]."""
     node, weight = leggauss(n)
     return 0.25 * np.pi * (node + 1.0), 0.25 * np.pi * weight
 
 
 @cache
 def meeting_table() -> np.ndarray:
-    """P, dP/dy, Q and dQ/dy over y in [0, FAR], shape (n + 1, 4)."""
+    """Return the p, dP/dy, Q and dQ/dy over y in [0, FAR], shape (n + 1, 4)."""
     # Here, because the contact node needs none of it.
     from scipy.special import j0, jv, roots_legendre
 
@@ -101,12 +101,14 @@ def _in_table(table, column, y):  # type: ignore[no-untyped-def]
 
 
 def missed_between(positions: np.ndarray, carrier: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """E* R_p times what interpolation misses of C(s, s), shape (n,).
+    """Return E* R_p times what interpolation misses of C(s, s), shape (n,).
 
     Parameters
     ----------
-    positions : ndarray, shape (n_positions, 3), of the load positions [R_p]
-    carrier, weight : ndarray, shape (n, k), load positions and weights of each point
+    positions : ndarray, shape (n_positions, 3)
+        Positions of the load positions [R_p].
+    carrier, weight : ndarray, shape (n, k)
+        Load positions and weights of each point.
     """
     return np.asarray(_missed_between(meeting_table(), positions, carrier, weight))
 

@@ -46,9 +46,13 @@ _MOST_CHANGES = 60  # of the active set
 class Push:
     """A tip over a place, pushed in along the axis.
 
+    Attributes
+    ----------
     tip : Tip
-    point : ndarray, shape (3,), x_0 on the surface, where the depth is zero [m]
-    axis : ndarray, shape (3,), unit, pointing out of the organ
+    point : ndarray, shape (3,)
+        x_0 on the surface, where the depth is zero [m].
+    axis : ndarray, shape (3,)
+        Unit, pointing out of the organ.
     """
 
     tip: Tip
@@ -60,13 +64,21 @@ class Push:
 class Touch:
     """What one tip feels, and where.
 
-    depth : d [m]
-    force : of the organ on the tip along the axis [N]
-    radius : of the disc with the area of the contact [m]
-    lean : ndarray, shape (3,), across the axis, the tangent of the angle between the axis and the
-        way from the centre of pressure to that of the ball; zero for other tips
-    vertices : ndarray of int, shape (n,), of the mesh under pressure
-    pressures : ndarray, shape (n,), p at them [Pa]
+    Attributes
+    ----------
+    depth : float
+        d [m].
+    force : float
+        Force of the organ on the tip along the axis [N].
+    radius : float
+        Radius of the disc with the area of the contact [m].
+    lean : ndarray, shape (3,)
+        Across the axis, the tangent of the angle between the axis and the way from the centre of
+        pressure to that of the ball; zero for other tips.
+    vertices : ndarray of int, shape (n,)
+        Vertices of the mesh under pressure.
+    pressures : ndarray, shape (n,)
+        p at them [Pa].
     """
 
     depth: float
@@ -81,9 +93,14 @@ class Touch:
 class Contact:
     """The contact of one or several tips at once.
 
-    touches : of each tip
-    loads : ndarray, shape (3 n_nodes,), nodal forces on the organ [N]
-    violation : worst mean penetration over a hat, over the largest depth
+    Attributes
+    ----------
+    touches : tuple[Touch, ...]
+        Touches of each tip.
+    loads : ndarray, shape (3 n_nodes,)
+        Nodal forces on the organ [N].
+    violation : float
+        Worst mean penetration over a hat, over the largest depth.
     """
 
     touches: tuple[Touch, ...]
@@ -122,11 +139,16 @@ class CondensedContact:
 
     Parameters
     ----------
-    elasticity : Elasticity, on a mesh fine around the tips
-    pushes : one for each tip
-    deepest : ndarray, shape (n_pushes,) or a number, the largest depth asked for later [m]
-    reach : radius of the candidate surface over that of the contact on a half-space
-    progress : is told which part of the condensation is done
+    elasticity : Elasticity
+        Elasticity on a mesh fine around the tips.
+    pushes : Sequence[Push]
+        One for each tip.
+    deepest : ndarray, shape (n_pushes,)
+        Or a number, the largest depth asked for later [m].
+    reach : float
+        Radius of the candidate surface over that of the contact on a half-space.
+    progress : Callable[[float], None] or None
+        Is told which part of the condensation is done.
 
     Raises
     ------
@@ -158,12 +180,14 @@ class CondensedContact:
         return np.array([(-zone.heights / zone.areas).min() for zone in self._zones])
 
     def solve(self, acting: Sequence[int], depths: Sequence[float]) -> Contact:
-        """The contact of some of the pushes at once.
+        """Return the contact of some of the pushes at once.
 
         Parameters
         ----------
-        acting : numbers of the pushes that act
-        depths : d of each of them [m]
+        acting : Sequence[int]
+            Numbers of the pushes that act.
+        depths : Sequence[float]
+            d of each of them [m].
 
         Raises
         ------
@@ -193,13 +217,13 @@ class CondensedContact:
         return Contact(tuple(_touch(*part) for part in parts), np.asarray(loads), float(worst))
 
     def displacements(self, contacts: Sequence[Contact]) -> np.ndarray:
-        """Displacements of the mesh's vertices, shape (n_contacts, n_vertices, 3) [m]."""
+        """Return displacements of the mesh's vertices, shape (n_contacts, n_vertices, 3) [m]."""
         solution = self.elasticity.solve(np.stack([contact.loads for contact in contacts], axis=1))
         return self.elasticity.at_vertices(solution).T.reshape(len(contacts), -1, 3)
 
 
 def through_centre(push: Push, touch: Touch) -> Push:
-    """The push of the same ball in the same place, its axis turned by what ``touch`` leans.
+    """Return the push of the same ball in the same place, its axis turned by what ``touch`` leans.
 
     Its force then acts along the way from the centre of pressure to the ball's; a few turns find
     the axis about which nothing leans. Other tips are left as they are.
@@ -211,7 +235,7 @@ def through_centre(push: Push, touch: Touch) -> Push:
 
 
 def half_space_radius(tip: Tip, depth: float) -> float:
-    """Radius a of the contact with a half-space at a depth [m]; the tip's own at most."""
+    """Return radius a of the contact with a half-space at a depth [m]; the tip's own at most."""
     if tip.shape == "flat":
         return tip.radius
 
@@ -225,7 +249,7 @@ def half_space_radius(tip: Tip, depth: float) -> float:
 
 
 def complementary(compliance: np.ndarray, needed: np.ndarray) -> np.ndarray:
-    """p >= 0 with C p - b >= 0 and p.(C p - b) = 0, by a primal-dual active set.
+    """Return p >= 0 with C p - b >= 0 and p.(C p - b) = 0, by a primal-dual active set.
 
     Hintermueller, Ito & Kunisch, SIAM J. Optim. 13:865 (2002); where the set comes back to an
     earlier one, it is found by non-negative least squares, |L^T p - L^-1 b| with C = L L^T.
@@ -263,7 +287,7 @@ def _by_active_set(compliance: np.ndarray, needed: np.ndarray) -> np.ndarray:
 
 
 def _balanced(compliance: np.ndarray, needed: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """Pressures with C p = b on the active hats, zero on the others."""
+    """Return the pressures with C p = b on the active hats, zero on the others."""
     pressure = np.zeros(len(needed))
     if active.any():
         block = cho_factor(compliance[np.ix_(active, active)])
@@ -290,7 +314,7 @@ def _touch(zone: _Zone, depth: float, pressure: np.ndarray) -> Touch:
 
 
 def _zone(elasticity: Elasticity, push: Push, deepest: float, reach: float) -> _Zone:
-    """Hats within reach of a tip, integrated on the faces that face it."""
+    """Return the hats within reach of a tip, integrated on the faces that face it."""
     mesh = elasticity.mesh
     radius = reach * half_space_radius(push.tip, deepest) + 2.0 * _edge_at(mesh, push.point)
     radius = min(push.tip.radius, radius)
@@ -337,7 +361,7 @@ def _zone(elasticity: Elasticity, push: Push, deepest: float, reach: float) -> _
 
 
 def _facing(elasticity: Elasticity, push: Push, distance: float) -> np.ndarray:
-    """Boundary faces that face the axis and come within a distance of the place."""
+    """Return the boundary faces that face the axis and come within a distance of the place."""
     mesh = elasticity.mesh
     corners = mesh.vertices[mesh.boundary_faces]
     near = np.linalg.norm(corners - push.point, axis=2).min(axis=1) < distance
@@ -346,14 +370,14 @@ def _facing(elasticity: Elasticity, push: Push, distance: float) -> np.ndarray:
 
 
 def _edge_at(mesh: TetMesh, point: np.ndarray) -> float:
-    """Length of the edges of the boundary at a point [m]."""
+    """Return the length of the edges of the boundary at a point [m]."""
     centroids = mesh.vertices[mesh.boundary_faces].mean(axis=1)
     nearest = np.linalg.norm(centroids - point, axis=1).argmin()
     return float(np.sqrt(2.0 * mesh.face_areas[nearest]))
 
 
 def _cylindrical(offset: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance from an axis, and position along it."""
+    """Return the distance from an axis, and position along it."""
     z = offset @ axis
     return np.sqrt(np.maximum((offset**2).sum(axis=-1) - z**2, 0.0)), z
 
@@ -374,7 +398,7 @@ def _hat_loads(
 def _distinct(
     zones: Sequence[_Zone], pushes: Sequence[Push]
 ) -> tuple[sp.csc_matrix, list[np.ndarray]]:
-    """The different hats of all tips, and which of them are each tip's.
+    """Return the different hats of all tips, and which of them are each tip's.
 
     Tips at one place share all hats but those at their rims; a hat is known by its vertex, its
     area and its axis.
@@ -394,7 +418,7 @@ def _distinct(
 def _condensed(
     elasticity: Elasticity, loads: sp.csc_matrix, progress: Callable[[float], None] | None
 ) -> np.ndarray:
-    """C = B^T K^-1 B, shape (m, m) [m3/Pa]."""
+    """Return C = B^T K^-1 B, shape (m, m) [m3/Pa]."""
     compliance = np.empty((loads.shape[1], loads.shape[1]))
     for start in range(0, loads.shape[1], _BATCH):
         batch = slice(start, start + _BATCH)

@@ -44,9 +44,14 @@ _TOLERANCE = 1e-7  # of the residual, relative to the force
 class Domain:
     """The cylinder that stands for the half-space, and the elements of its body.
 
-    element : size of the elements around the contact [R]
-    extent : radius and height of the cylinder [R]
-    penalty : epsilon [E / R]
+    Attributes
+    ----------
+    element : float
+        Size of the elements around the contact [R].
+    extent : float
+        Radius and height of the cylinder [R].
+    penalty : float
+        Epsilon [E / R].
     """
 
     element: float = 0.1
@@ -57,11 +62,18 @@ class Domain:
 class Indentation(NamedTuple):
     """What a depth takes.
 
-    depth : [R]
-    force : [E R^2]
-    energy : Pi [E R^3]
-    contact : largest deformed radius at which the sphere touches [R]
-    min_det : least det F
+    Attributes
+    ----------
+    depth : float
+        Depth [R].
+    force : float
+        Force [E R^2].
+    energy : float
+        Pi [E R^3].
+    contact : float
+        Largest deformed radius at which the sphere touches [R].
+    min_det : float
+        Least det F.
     """
 
     depth: float
@@ -103,9 +115,12 @@ class SphereIndentation:
 
     Parameters
     ----------
-    poisson_ratio : nu
-    large_strain : neo-Hookean, and contact on the deformed surface; otherwise Sneddon's problem
-    domain : Domain
+    poisson_ratio : float
+        Nu.
+    large_strain : bool
+        Neo-Hookean, and contact on the deformed surface; otherwise Sneddon's problem.
+    domain : Domain or None
+        Domain.
     """
 
     def __init__(
@@ -118,7 +133,7 @@ class SphereIndentation:
         self._rounding = _ROUNDING * float(self.body.volume.sum())
 
     def press(self, depths: Iterable[float]) -> list[Indentation]:
-        """The equilibria at rising depths [R].
+        """Return the equilibria at rising depths [R].
 
         Raises
         ------
@@ -133,7 +148,7 @@ class SphereIndentation:
         return found
 
     def _advance(self, state: _State, depth: float) -> _State:
-        """The equilibrium at a depth, in steps that halve where Newton's method fails."""
+        """Return the equilibrium at a depth, in steps that halve where Newton's method fails."""
         step = min(_STEP, depth - state.depth)
         while state.depth < depth - 1e-12:
             step = min(step, depth - state.depth)
@@ -151,7 +166,7 @@ class SphereIndentation:
         return state
 
     def _equilibrium(self, u: np.ndarray, depth: float) -> np.ndarray:
-        """Newton's method as a descent of the energy."""
+        """Return Newton's method as a descent of the energy."""
         free = self.body.free
         for _ in range(_MAX_ITERATIONS):
             residual, force = self._residual(u, depth)
@@ -186,7 +201,7 @@ class SphereIndentation:
         return distance - 1.0, offset / distance[..., None], 1.0 / distance
 
     def _energy(self, u: np.ndarray, depth: float) -> float:
-        """Pi, infinite where a quadrature point is inverted."""
+        """Return the pi, infinite where a quadrature point is inverted."""
         if self.large_strain and self.body.min_det(u) <= 0.0:
             return np.inf
         into = np.maximum(-self._gap(u, depth)[0], 0.0)
@@ -195,7 +210,7 @@ class SphereIndentation:
         )
 
     def _residual(self, u: np.ndarray, depth: float) -> tuple[np.ndarray, float]:
-        """dPi / du, shape (2 n_nodes,), and dPi / dd."""
+        """Return dPi / du, shape (2 n_nodes,), and dPi / dd."""
         gap, normal, _ = self._gap(u, depth)
         pressure = self.domain.penalty * np.maximum(-gap, 0.0) * self.body.top_area
         outer = -np.einsum("fq,fqa,fqd->fad", pressure, self.body.top_shape, normal)
@@ -225,7 +240,7 @@ class SphereIndentation:
 
 
 def _ticks(domain: Domain) -> np.ndarray:
-    """Edges of the elements along r and -z: of one size around the contact, then growing."""
+    """Return edges of the elements along r and -z: of one size around the contact, then growing."""
     ticks = [0.0]
     while ticks[-1] < domain.extent:
         ticks.append(ticks[-1] + max(domain.element, _GROWTH * (ticks[-1] - _FINE)))

@@ -22,7 +22,7 @@ from avatar_core.common.arrays import FloatArray
 def unit_stiffness(
     basis: CellBasis, nodes: np.ndarray, volume_fraction: FloatArray | None = None
 ) -> tuple[sp.csr_matrix, sp.csr_matrix]:
-    """The shear part for mu = 1 and the volumetric part for lambda = 1.
+    """Return the shear part for mu = 1 and the volumetric part for lambda = 1.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class _Pattern:
         )
 
     def assemble(self, blocks: FloatArray) -> sp.csr_matrix:
-        """The sum of all blocks, shape (n_tets, n_shape, n_shape, 3, 3)."""
+        """Return the sum of all blocks, shape (n_tets, n_shape, n_shape, 3, 3)."""
         data = (self._sum @ blocks.reshape(-1, 9)).reshape(-1, 3, 3)
         size = 3 * self.n_nodes
         return sp.bsr_matrix((data, self._column, self._start), shape=(size, size)).tocsr()

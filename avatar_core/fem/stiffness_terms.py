@@ -24,30 +24,36 @@ from avatar_core.geometry.mesh import TetMesh
 
 @BilinearForm
 def divergence(u, q, w):  # type: ignore[no-untyped-def]
-    """q div(u), the coupling of displacement and pressure."""
+    """Return q div(u), the coupling of displacement and pressure."""
     return q * div(u)
 
 
 @BilinearForm
 def pressure_mass(p, q, w):  # type: ignore[no-untyped-def]
-    """p q."""
+    """Return p q."""
     return p * q
 
 
 @BilinearForm
 def scalar_mass(u, v, w):  # type: ignore[no-untyped-def]
-    """u v, one component."""
+    """Return u v, one component."""
     return u * v
 
 
 class StiffnessTerms:
     """The constant matrices that a stiffness is made of, shared by all values of the material.
 
+    Parameters
+    ----------
     mesh : TetMesh
-    quadratic : whether displacements are (P2, Taylor-Hood), or linear (P1)
-    volume_fraction : ndarray, shape (n_tets,), of an inclusion in each tetrahedron, or None
-    supported : vertices of the faces of each support, ndarrays of shape (n, 3)
-    resection : that ties the sides of a cut, or None
+    quadratic : bool
+        Whether displacements are (P2, Taylor-Hood), or linear (P1).
+    volume_fraction : ndarray, shape (n_tets,)
+        Volume fraction of an inclusion in each tetrahedron, or None.
+    supported : Sequence[ndarray]
+        Vertices of the faces of each support, ndarrays of shape (n, 3).
+    resection : Resection or None
+        Resection that ties the sides of a cut, or None.
     """
 
     def __init__(
@@ -86,7 +92,7 @@ class StiffnessTerms:
 
     @cached_property
     def spring_mass(self) -> tuple[sp.csr_matrix, ...]:
-        """int u.v da over each support, int [u].[v] da over each strip of a cut.
+        """Return int u.v da over each support, int [u].[v] da over each strip of a cut.
 
         Shapes (3 n_nodes, 3 n_nodes) [m^2].
         """
@@ -101,7 +107,7 @@ class StiffnessTerms:
         return grounded + self._resection.jump_mass(self._organ, nodes, self.n_nodes)
 
     def nodes_of(self, faces: np.ndarray) -> np.ndarray:
-        """Nodes of faces (n, 3): 3 (P1) or 6 (corners, then edges 01, 12, 20) columns."""
+        """Return nodes of faces (n, 3): 3 (P1) or 6 (corners, then edges 01, 12, 20) columns."""
         if not self._quadratic:
             return faces
         n_vertices = self._mesh.nvertices
@@ -126,7 +132,7 @@ class StiffnessTerms:
 
     @cached_property
     def mass(self) -> sp.csr_matrix:
-        """int N_a N_b dx, shape (n_nodes, n_nodes) [m^3]."""
+        """Return int N_a N_b dx, shape (n_nodes, n_nodes) [m^3]."""
         matrix = scalar_mass.assemble(Basis(self._mesh, self._shape, intorder=4)).tocsr()
         order = self.nodes_first(self._basis)
         return matrix[order][:, order]
@@ -137,7 +143,7 @@ class StiffnessTerms:
         return rslab.ldlt(sp.csc_matrix(self.mixed[2]), threads=1)
 
     def nodes_first(self, basis: Basis) -> np.ndarray:
-        """scikit-fem's number of each degree of freedom, in our order."""
+        """Return scikit-fem's number of each degree of freedom, in our order."""
         dofs = basis.nodal_dofs.T
         if self._quadratic:
             dofs = np.concatenate([dofs, basis.edge_dofs.T])

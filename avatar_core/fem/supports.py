@@ -36,9 +36,14 @@ LEAST_HELD = 1e-6  # of q(r) L / E: below, 1 N moves a liver by metres
 class Support:
     """A part of the surface that springs hold.
 
-    name : "bare_area", for example; letters, digits and _
-    faces : ndarray of bool, shape (n_faces,), over ``mesh.boundary_faces``
-    stiffness : k, per area [N/m^3]
+    Attributes
+    ----------
+    name : str
+        "bare_area", for example; letters, digits and _.
+    faces : ndarray of bool, shape (n_faces,)
+        Over ``mesh.boundary_faces``.
+    stiffness : float
+        k, per area [N/m^3].
 
     Raises
     ------
@@ -83,7 +88,7 @@ def _mass(u, v, w):  # type: ignore[no-untyped-def]
 
 
 def boundary_mass(mesh: MeshTet, shape: Element, faces: FloatArray) -> sp.csr_matrix:
-    """int_faces N_a N_b da of one component, scikit-fem's numbering [m^2].
+    """Return int_faces N_a N_b da of one component, scikit-fem's numbering [m^2].
 
     Parameters
     ----------
@@ -100,15 +105,19 @@ def boundary_mass(mesh: MeshTet, shape: Element, faces: FloatArray) -> sp.csr_ma
 class RigidMotion:
     """The rigid motion that supports resist least.
 
-    resistance : q of it [N/m^3]
-    text : what it is, in words
+    Attributes
+    ----------
+    resistance : float
+        q of it [N/m^3].
+    text : str
+        What it is, in words.
     """
 
     resistance: float
     text: str
 
     def holds(self, length: float, young_modulus: float) -> bool:
-        """Whether an organ of a length [m] and Young's modulus [Pa] counts as held."""
+        """Return whether an organ of a length [m] and Young's modulus [Pa] counts as held."""
         return self.resistance * length >= LEAST_HELD * young_modulus
 
 
@@ -140,7 +149,7 @@ def least_resisted(
     part: np.ndarray,
     springs: tuple[FloatArray, FloatArray] | None = None,
 ) -> RigidMotion:
-    """The least Rayleigh quotient of the six rigid motions, and its motion.
+    """Return the least Rayleigh quotient of the six rigid motions, and its motion.
 
     Rotations are about the centroid of the boundary and scaled by its radius of gyration.
 
@@ -166,14 +175,14 @@ def least_resisted(
 
 
 def _rigid_motions(points: FloatArray) -> FloatArray:
-    """Three translations and three rotations at points, shape (..., 3, 6)."""
+    """Return three translations and three rotations at points, shape (..., 3, 6)."""
     translations = np.broadcast_to(np.eye(3), (*points.shape, 3))
     rotations = np.stack([np.cross(axis, points) for axis in np.eye(3)], axis=-1)
     return np.concatenate([translations, rotations], axis=-1)
 
 
 def _described(motion: FloatArray) -> str:
-    """A rigid motion in words, by whichever of its parts is larger."""
+    """Return a rigid motion in words, by whichever of its parts is larger."""
     shift, turn = motion[:3], motion[3:]
     turns = np.linalg.norm(turn) > np.linalg.norm(shift)
     axis = turn if turns else shift

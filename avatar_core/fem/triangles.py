@@ -23,7 +23,7 @@ def triangle_shape(barycentric: np.ndarray) -> np.ndarray:
 
 
 def subdivided_rule(pieces: int) -> tuple[np.ndarray, np.ndarray]:
-    """A rule of degree 5 on each of pieces^2 equal sub-triangles; weights sum to one."""
+    """Return a rule of degree 5 on each of pieces^2 equal sub-triangles; weights sum to one."""
     local, weight = get_quadrature(RefTri, 5)
     bary = np.stack([1.0 - local[0] - local[1], local[0], local[1]], axis=1)
     corners = []

@@ -30,7 +30,7 @@ POSTERIOR = np.array([0.0, -1.0, 0.0])
 
 
 def attachments_by_rule(mesh: TetMesh) -> dict[str, np.ndarray]:
-    """Faces of each of ``ATTACHMENTS``, ndarrays of bool, shape (n_faces,); no face has two.
+    """Return faces of each of ``ATTACHMENTS``, ndarrays of bool, shape (n_faces,); no face has two.
 
     Strips are as wide as in anatomy, or so that triangles of the mesh fill them without a gap.
     """

@@ -18,7 +18,7 @@ _TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])  # the patient's axes of DICOM are LPS
 
 
 def read_segmentation(path: Path) -> Volume:
-    """A segmentation (SEG) in one file, its segments named by their numbers.
+    """Return a segmentation (SEG) in one file, its segments named by their numbers.
 
     BINARY and FRACTIONAL have a layer for each segment. A FRACTIONAL one holds the voxels from
     half of MaximumFractionalValue on. Voxels of a LABELMAP are numbers of segments, 0 outside.
@@ -58,7 +58,7 @@ def read_segmentation(path: Path) -> Volume:
 
 
 def is_series(folder: Path) -> bool:
-    """Whether a folder seems to hold a series; opens no more than a few of its files."""
+    """Return whether a folder seems to hold a series; opens no more than a few of its files."""
     try:
         files = sorted(path for path in folder.iterdir() if path.is_file())[:_LOOKED_AT]
         return any(_is_dicom(path) for path in files)
@@ -67,7 +67,7 @@ def is_series(folder: Path) -> bool:
 
 
 def read_series(path: Path) -> Volume:
-    """The image of a series or of a file of many frames.
+    """Return the image of a series or of a file of many frames.
 
     Values are float32, in Hounsfield units where the file has them.
 
@@ -96,7 +96,7 @@ def read_series(path: Path) -> Volume:
 
 
 def _libraries(name: str) -> tuple[Any, Any]:
-    """highdicom, and pydicom's reader of a file."""
+    """Return highdicom, and pydicom's reader of a file."""
     try:
         import highdicom
         from pydicom import dcmread

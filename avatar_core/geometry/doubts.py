@@ -23,18 +23,23 @@ _SAMPLES = 32  # points along each side of a lesion's box
 def doubts_of(
     organ: SurfaceMesh, inside: Sequence[SurfaceMesh] = (), has_groups: bool = False
 ) -> tuple[str, ...]:
-    """Notices of what is doubtful of an organ and its lesions, one line each.
-
-    inside : surfaces of lesions; has_groups : clamp and accessible region are given by groups
+    """Return the notices of what is doubtful of an organ and its lesions, one line each.
 
     Raises SurfaceError if less than half of a lesion lies in the organ.
+
+    Parameters
+    ----------
+    inside : Sequence[SurfaceMesh]
+        Surfaces of lesions.
+    has_groups : bool
+        Clamp and accessible region are given by groups.
     """
     placed = [notice for lesion in inside for notice in _placement(organ, lesion)]
     return (*placed, *(() if has_groups else size_notice(organ)), *_bridge_notice(organ))
 
 
 def size_notice(organ: SurfaceMesh) -> tuple[str, ...]:
-    """A notice if the organ is smaller or larger than livers are."""
+    """Return a notice if the organ is smaller or larger than livers are."""
     low, high = LIVER_VOLUMES
     if low <= organ.volume <= high:
         return ()
@@ -66,7 +71,7 @@ def _placement(organ: SurfaceMesh, lesion: SurfaceMesh) -> tuple[str, ...]:
 
 
 def _bridge_notice(organ: SurfaceMesh) -> tuple[str, ...]:
-    """A notice if erosion by 5 mm splits the organ into bodies."""
+    """Return a notice if erosion by 5 mm splits the organ into bodies."""
     low, high = organ.bounding_box
     shape = np.ceil((high - low) / _SPACING).astype(int)
     points = box_points(low, low + _SPACING * shape, shape.tolist())

@@ -28,7 +28,7 @@ REGIONS = ("clamped", "accessible")  # groups that are no supports
 
 
 def read_groups(path: str | Path) -> dict[str, np.ndarray]:
-    """The groups of points of an ``.npz`` file by name, each of shape (n, 3) [m].
+    """Return the groups of points of an ``.npz`` file by name, each of shape (n, 3) [m].
 
     Raises
     ------
@@ -46,7 +46,7 @@ def read_groups(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def faces_of_groups(mesh: TetMesh, points: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Faces of each group of points [m], ndarrays of bool, shape (n_faces,)."""
+    """Return the faces of each group of points [m], ndarrays of bool, shape (n_faces,)."""
     return {name: _covered(mesh, group) for name, group in points.items()}
 
 
@@ -65,12 +65,12 @@ def regions_of_groups(
 
 
 def regions_from_groups(mesh: TetMesh, path: str | Path) -> Regions:
-    """:func:`regions_of_groups` of a file."""
+    """Return :func:`regions_of_groups` of a file."""
     return regions_of_groups(mesh, read_groups(path), path)
 
 
 def _covered(mesh: TetMesh, points: np.ndarray) -> np.ndarray:
-    """Faces that a group of points covers, shape (n_faces,)."""
+    """Return the faces that a group of points covers, shape (n_faces,)."""
     points, corners = np.unique(points, axis=0), mesh.vertices[mesh.boundary_faces]
     tree = cKDTree(points)
     if len(points) < _FEW:

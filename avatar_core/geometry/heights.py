@@ -25,12 +25,18 @@ def heights_around(
 
     Parameters
     ----------
-    offsets : from the surface, exact or of a grid
-    points : ndarray, shape (n, 3), on the surface or beside it [m]
-    normals : ndarray, shape (n, 3), unit vectors, outward
-    radii : ndarray, shape (m,) or (m, n), of the circles [m]
-    angles : ndarray, directions on the circles
-    steepest : squared cosine of the side that counts as the steepest
+    offsets : Offsets
+        Offsets from the surface, exact or of a grid.
+    points : ndarray, shape (n, 3)
+        Points on the surface or beside it [m].
+    normals : ndarray, shape (n, 3)
+        Unit vectors, outward.
+    radii : ndarray, shape (m,) or (m, n)
+        Radii of the circles [m].
+    angles : ndarray
+        Directions on the circles.
+    steepest : float
+        Squared cosine of the side that counts as the steepest.
     """
     first, second = tangents(normals)
     around = np.cos(angles)[:, None, None] * first + np.sin(angles)[:, None, None] * second
@@ -45,7 +51,7 @@ def heights_around(
 
 
 def tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors across each normal and each other."""
+    """Return two unit vectors across each normal and each other."""
     least = np.eye(3)[np.abs(normals).argmin(axis=1)]
     first = np.cross(normals, least)
     first /= np.linalg.norm(first, axis=1, keepdims=True)

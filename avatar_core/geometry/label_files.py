@@ -53,7 +53,7 @@ def is_label_map(path: Path) -> bool:
 
 
 def read_label_map(path: Path) -> Volume:
-    """All layers of a file, as whole numbers; what is not a number is 0, as outside.
+    """Return all layers of a file, as whole numbers; what is not a number is 0, as outside.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def read_label_map(path: Path) -> Volume:
 
 
 def read_image(path: Path) -> Volume:
-    """The one image of a file, or of a folder with a series of DICOM.
+    """Return the one image of a file, or of a folder with a series of DICOM.
 
     NaN becomes 0, or the darkest value if that is below.
 
@@ -94,7 +94,7 @@ def _read(path: Path, read_dicom: Callable[[Path], Volume]) -> Volume:
 
 
 def _whole(values: NDArray[Any], name: str) -> tuple[NDArray[np.int32], tuple[str, ...]]:
-    """The nearest whole numbers of labels, and a notice where they are not the same."""
+    """Return the nearest whole numbers of labels, and a notice where they are not the same."""
     labels, worst, example = np.empty(values.shape, np.int32), 0.0, 0.0
     for k in range(values.shape[1]):  # one slice in memory at a time
         one = np.where(np.isnan(values[:, k]), 0.0, values[:, k])
@@ -150,7 +150,7 @@ def _volume_of(image: Any, path: Path) -> Volume:
 
 
 def _differing_forms(image: Any, mm: float) -> tuple[str, ...]:
-    """A notice if qform and sform are both given and place voxels differently."""
+    """Return a notice if qform and sform are both given and place voxels differently."""
     header = image.header
     if not (header["qform_code"] and header["sform_code"]):
         return ()
@@ -211,7 +211,7 @@ def _dtype(name: str, header: Any) -> np.dtype[Any]:
 
 
 def _decoded(name: str, content: bytes, encoding: str, n_bytes: int, skip: int) -> bytes:
-    """The voxels' bytes behind those to skip; no more than announced are decompressed.
+    """Return the voxels' bytes behind those to skip; no more than announced are decompressed.
 
     skip : -1 for uncompressed voxels at the end of the file
     """
@@ -230,7 +230,7 @@ def _decoded(name: str, content: bytes, encoding: str, n_bytes: int, skip: int) 
 
 
 def _inflated(content: bytes, n_bytes: int) -> bytes:
-    """The first bytes of a gzip file of one or more members."""
+    """Return the first bytes of a gzip file of one or more members."""
     found = b""
     while content and len(found) < n_bytes:
         member = zlib.decompressobj(zlib.MAX_WBITS | 16)
@@ -266,7 +266,7 @@ def _unplaced(name: str) -> SurfaceError:
 
 
 def _segments(header: Any, n_layers: int) -> tuple[Segment, ...]:
-    """The segments that Slicer names, ``Segment0_Name``, ``_LabelValue`` and ``_Layer``.
+    """Return the segments that Slicer names, ``Segment0_Name``, ``_LabelValue`` and ``_Layer``.
 
     Slicer before 4.11 writes neither: each segment has a layer of its own, which holds 1.
     """

@@ -56,7 +56,7 @@ def surface_of_label(
     is_organ: bool = True,
     mm: float = 1.0,
 ) -> tuple[Soup, tuple[str, ...]]:
-    """Surface of labels, in RAS and the file's unit, and notices.
+    """Return the surface of labels, in RAS and the file's unit, and notices.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def _require_voxels(name: str, affine: FloatArray) -> None:
 
 
 def _segments(found: Volume, name: str) -> tuple[Segment, ...]:
-    """The segments of a map; without names, one for each number but zero.
+    """Return the segments of a map; without names, one for each number but zero.
 
     Raises SurfaceError of an image.
     """
@@ -127,7 +127,7 @@ def _segments(found: Volume, name: str) -> tuple[Segment, ...]:
 
 
 def _chosen(segments: Sequence[Segment], name: str, label: int | str | None) -> tuple[Segment, ...]:
-    """The segments of a label, which may name several with commas between."""
+    """Return the segments of a label, which may name several with commas between."""
     if label is None:
         found = [segments] if len(segments) == 1 else [()]
     elif fitting := _fitting(segments, str(label)):
@@ -146,14 +146,14 @@ def _chosen(segments: Sequence[Segment], name: str, label: int | str | None) -> 
 
 
 def _fitting(segments: Sequence[Segment], label: str) -> Sequence[Segment]:
-    """Segments of that name, in any case if there is none, or of that number."""
+    """Return the segments of that name, in any case if there is none, or of that number."""
     found = [one for one in segments if one.name == label]
     found = found or [one for one in segments if one.name.lower() == label.lower()]
     return found or [one for one in segments if str(one.number) == label]
 
 
 def _box_of(found: Volume, name: str, one: Segment) -> Box:
-    """Bounding box of a segment; only one mask of a whole map is in memory at a time."""
+    """Return the bounding box of a segment; only one mask of a whole map is in memory at a time."""
     if not one.layer < len(found.values):
         raise SurfaceError(f"{name}: no layer {one.layer}, of {one.name}; save it again")
     mask = found.values[one.layer] == one.value
@@ -170,7 +170,7 @@ def _mask_in(box: Box, found: Volume, chosen: Sequence[Segment]) -> NDArray[np.b
 def _numbered(
     found: Volume, segments: Sequence[Segment], box: Box
 ) -> Iterator[tuple[list[str], NDArray[np.int16]]]:
-    """Segments of each layer in a box with a border, as :func:`left_out` takes them."""
+    """Yield the segments of each layer in a box with a border, as :func:`left_out` takes them."""
     for layer in range(len(found.values)):
         own = sorted((one for one in segments if one.layer == layer), key=lambda one: one.value)
         if own:
@@ -202,7 +202,7 @@ def _require_whole(
 
 
 def _surface_of_mask(inside: NDArray[np.bool_], affine: FloatArray, corner: IntArray) -> Soup:
-    """Marching cubes on a mask averaged to 2 mm and blurred by half its coarsest voxel.
+    """Run marching cubes on a mask averaged to 2 mm and blurred by half its coarsest voxel.
 
     The blur draws round surfaces in: at a level of one half, a ball of 5 mm would lose a fifth of
     its volume. The level is the one at which the surface holds the volume of the mask.
@@ -223,7 +223,7 @@ def _surface_of_mask(inside: NDArray[np.bool_], affine: FloatArray, corner: IntA
 
 
 def _at_volume(values: FloatArray, wanted: float) -> Soup:
-    """The surface of a level that holds a volume [voxels]: from one half on, by secants."""
+    """Return the surface of a level that holds a volume [voxels]: from one half on, by secants."""
     levels, volumes = [0.5], []
     for _ in range(_MOST_LEVELS):
         vertices, faces = march(levels[-1] - values)
@@ -240,14 +240,14 @@ def _at_volume(values: FloatArray, wanted: float) -> Soup:
 
 
 def _block_mean(mask: NDArray[np.bool_], factor: IntArray) -> FloatArray:
-    """Mean over blocks of factor voxels, the mask padded with outside to whole blocks."""
+    """Return mean over blocks of factor voxels, the mask padded with outside to whole blocks."""
     padded = np.pad(mask, [(0, int(-n % f)) for n, f in zip(mask.shape, factor, strict=True)])
     blocks = [int(k) for n, f in zip(padded.shape, factor, strict=True) for k in (n // f, f)]
     return padded.reshape(blocks).mean(axis=(1, 3, 5))
 
 
 def march(values: FloatArray) -> Soup:
-    """Zero surface of a grid, negative inside, by marching cubes in index coordinates.
+    """Return the zero surface of a grid, negative inside, by marching cubes in index coordinates.
 
     values : ndarray, shape (nx, ny, nz). Returns vertices (n, 3) and outward faces (m, 3).
     """

@@ -26,7 +26,7 @@ _SIDES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior")
 
 
 def box_of(mask: Mask) -> Box:
-    """Bounding box of a mask."""
+    """Return the bounding box of a mask."""
     box = [slice(None)] * 3
     for axis in (2, 1, 0):  # each looks at what is left by those before
         used = mask[tuple(box)].any(axis=tuple(a for a in range(3) if a != axis))
@@ -36,7 +36,7 @@ def box_of(mask: Mask) -> Box:
 
 
 def around(boxes: Sequence[Box]) -> Box:
-    """The smallest box that holds all boxes."""
+    """Return the smallest box that holds all boxes."""
     x, y, z = (
         slice(min(side.start for side in sides), max(side.stop for side in sides))
         for sides in zip(*boxes, strict=True)
@@ -52,7 +52,7 @@ def cavities(organ: Mask) -> tuple[IntArray, int]:
 
 
 def filled(organ: Mask, part: Mask) -> tuple[Mask, float]:
-    """The organ with what its mask leaves out for a part of it, such as a lesion.
+    """Return the organ with what its mask leaves out for a part of it, such as a lesion.
 
     A piece of the part belongs to the organ if the organ touches half of its surface, as it does
     where a lesion was cut out of the organ's label, and with the rest of a cavity half full of it.
@@ -71,14 +71,14 @@ def filled(organ: Mask, part: Mask) -> tuple[Mask, float]:
 
 
 def _belonging(some: IntArray, every: IntArray) -> Mask:
-    """Whether some are half of all, by number; number 0 does not belong."""
+    """Return whether some are half of all, by number; number 0 does not belong."""
     return (some >= _ENCLOSED * every) & (np.arange(len(every)) > 0)
 
 
 def left_out(
     organ: Mask, cavity: IntArray, layers: Iterable[tuple[Sequence[str], IntArray]], ml: float
 ) -> tuple[dict[str, float], list[str]]:
-    """Labels that are cut out of the organ, and cavities that no label fills.
+    """Return the labels that are cut out of the organ, and cavities that no label fills.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def left_out(
 
 
 def cut_off(organ: Mask, shape: Sequence[int], box: Box, affine: FloatArray) -> list[str]:
-    """Notices of ends of the organ at the border of its image.
+    """Return the notices of ends of the organ at the border of its image.
 
     shape, affine : of the image, to RAS [mm]; box : of the organ's mask without its border
     """
@@ -146,7 +146,7 @@ def cut_off(organ: Mask, shape: Sequence[int], box: Box, affine: FloatArray) -> 
 
 
 def in_ml(volume: float) -> str:
-    """A volume [ml] in words."""
+    """Return a volume [ml] in words."""
     return f"{volume:,.0f} ml" if volume >= 10.0 else f"{volume:.2g} ml"
 
 

@@ -35,7 +35,14 @@ TILT = 10.0  # rotations tried: 24 turns of the axes, each tilted by this about 
 class GridBox:
     """Where the points of a regular grid lie: shared by all organs of a base.
 
-    origin : lowest corner [m]; spacing : the same along x, y, z [m]; shape : points (nx, ny, nz)
+    Attributes
+    ----------
+    origin : tuple[float, float, float]
+        Lowest corner [m].
+    spacing : float
+        The same along x, y, z [m].
+    shape : tuple[int, int, int]
+        Points (nx, ny, nz).
     """
 
     origin: tuple[float, float, float]
@@ -62,9 +69,14 @@ class GridBox:
 class DistanceGrid:
     """Signed distance to an organ on a regular grid, negative inside.
 
-    origin : ndarray, shape (3,), position of values[0, 0, 0] [m]
-    spacing : distance of neighbouring grid points, the same along x, y, z [m]
-    values : ndarray, shape (nx, ny, nz) [m]
+    Attributes
+    ----------
+    origin : ndarray, shape (3,)
+        Position of values[0, 0, 0] [m].
+    spacing : float
+        Distance of neighbouring grid points, the same along x, y, z [m].
+    values : ndarray, shape (nx, ny, nz)
+        Values [m].
     """
 
     origin: FloatArray
@@ -106,9 +118,14 @@ class DistanceGrid:
 class OrientationOffset:
     """The rotation, among 24 turns of the axes and small tilts, that best fits a reference.
 
-    rotation : ndarray, shape (3, 3), turns the surface onto the reference
-    angle : of that rotation [degrees]
-    gain : least misfit of turns below 45 degrees over the least misfit of all, >= 1
+    Attributes
+    ----------
+    rotation : ndarray, shape (3, 3)
+        Turns the surface onto the reference.
+    angle : float
+        Angle of that rotation [degrees].
+    gain : float
+        Least misfit of turns below 45 degrees over the least misfit of all, >= 1.
     """
 
     rotation: FloatArray
@@ -132,7 +149,7 @@ class OrientationOffset:
 
 
 def padded_box(surfaces: Sequence[SurfaceMesh], spacing: float, padding: float) -> GridBox:
-    """Box that reaches padding [m] beyond all surfaces on every side."""
+    """Return the box that reaches padding [m] beyond all surfaces on every side."""
     low = np.min([surface.bounding_box[0] for surface in surfaces], axis=0)
     high = np.max([surface.bounding_box[1] for surface in surfaces], axis=0)
     nx, ny, nz = (int(n) + 1 for n in np.ceil((high - low + 2 * padding) / spacing))
@@ -143,20 +160,26 @@ def padded_box(surfaces: Sequence[SurfaceMesh], spacing: float, padding: float) 
 def distance_grid(
     surface: SurfaceMesh, spacing: float, padding: float, band: float | None = None
 ) -> DistanceGrid:
-    """Signed distance on a grid that reaches padding [m] beyond the surface on every side.
+    """Return signed distance on a grid that reaches padding [m] beyond the surface on every side.
 
-    band : see `distance_in_box`
+    Parameters
+    ----------
+    band : float or None
+        See `distance_in_box`.
     """
     return distance_in_box(surface, padded_box([surface], spacing, padding), band)
 
 
 def distance_in_box(surface: SurfaceMesh, box: GridBox, band: float | None = None) -> DistanceGrid:
-    """Signed distance at the points of a box; what sticks out of the box is cut off.
-
-    band : distances are cut to [-band, band] and computed only there, for fine grids [m]; a
-        hierarchy of coarser grids excludes the points that are farther away
+    """Return the signed distance at the points of a box; what sticks out of the box is cut off.
 
     Raises SurfaceError if the band is narrower than two spacings: less spoils the isosurface.
+
+    Parameters
+    ----------
+    band : float or None
+        Distances are cut to [-band, band] and computed only there, for fine grids [m]; a hierarchy
+        of coarser grids excludes the points that are farther away.
     """
     origin = np.array(box.origin)
     if band is None:
@@ -212,7 +235,7 @@ def reinitialize(grid: DistanceGrid) -> DistanceGrid:
 
 
 def dice(one: DistanceGrid, other: DistanceGrid) -> float:
-    """Overlap of two organs on one box, 2 |A and B| / (|A| + |B|), 1 if they are equal.
+    """Return the overlap of two organs on one box, 2 |A and B| / (|A| + |B|), 1 if they are equal.
 
     The larger of two signed distances is a level set of the intersection.
 
@@ -227,7 +250,7 @@ def dice(one: DistanceGrid, other: DistanceGrid) -> float:
 
 
 def isosurface(grid: DistanceGrid, name: str = "isosurface") -> SurfaceMesh:
-    """Zero surface of the grid by marching cubes, faces outward, closed along the border.
+    """Return zero surface of the grid by marching cubes, faces outward, closed along the border.
 
     What is inside at the border of the grid is cut off there.
 
@@ -240,7 +263,7 @@ def isosurface(grid: DistanceGrid, name: str = "isosurface") -> SurfaceMesh:
 
 
 def _in_space(grid: DistanceGrid, index: FloatArray, faces: IntArray, name: str) -> SurfaceMesh:
-    """A marched surface from index coordinates to metres."""
+    """Return a marched surface from index coordinates to metres."""
     if len(faces) == 0:
         raise SurfaceError(
             f"{name}: nothing of the organ lies in the grid; move the box onto it, or choose a "
@@ -250,7 +273,7 @@ def _in_space(grid: DistanceGrid, index: FloatArray, faces: IntArray, name: str)
 
 
 def grid_points(origin: FloatArray, spacing: float, shape: Sequence[int]) -> FloatArray:
-    """Points of a regular grid, z fastest, shape (nx ny nz, 3) [m]."""
+    """Return the points of a regular grid, z fastest, shape (nx ny nz, 3) [m]."""
     axes = [o + spacing * np.arange(n) for o, n in zip(origin, shape, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
@@ -259,7 +282,7 @@ def grid_points(origin: FloatArray, spacing: float, shape: Sequence[int]) -> Flo
 
 
 def orientation_offset(surface: SurfaceMesh, reference: SurfaceMesh) -> OrientationOffset:
-    """Rotation R that brings the surface closest to the reference (the phantom).
+    """Return the rotation R that brings the surface closest to the reference (the phantom).
 
     min over R of the mean of |phi_surface(R^T x) - phi_reference(x)|^2 over a ball, both surfaces
     centred, scaled to 1.5 litres, phi cut to [-30, 10] mm. R runs over the 24 turns of the axes,

@@ -36,10 +36,14 @@ ANTERIOR = np.array([0.0, 1.0, 0.0])
 class TetMesh:
     """A tetrahedral mesh with positively oriented elements.
 
-    vertices : ndarray, shape (n_vertices, 3) [m]
+    Attributes
+    ----------
+    vertices : ndarray, shape (n_vertices, 3)
+        Vertices [m].
     tets : ndarray of int, shape (n_tets, 4)
-    pairs : ndarray of int, shape (n_pairs, 2), vertices of the two sides of a cut that lie at one
-        place; None for a whole organ. Faces between the sides are no boundary.
+    pairs : ndarray of int, shape (n_pairs, 2)
+        Vertices of the two sides of a cut that lie at one place; None for a whole organ. Faces
+        between the sides are no boundary.
     """
 
     vertices: np.ndarray
@@ -157,8 +161,12 @@ class TetMesh:
 class Regions:
     """Where the organ is held and where a tool may touch it.
 
-    clamped : ndarray of bool, shape (n_faces,), over ``TetMesh.boundary_faces``
-    accessible : ndarray of bool, shape (n_faces,), disjoint from the clamp's neighbourhood
+    Attributes
+    ----------
+    clamped : ndarray of bool, shape (n_faces,)
+        Over ``TetMesh.boundary_faces``.
+    accessible : ndarray of bool, shape (n_faces,)
+        Disjoint from the clamp's neighbourhood.
     """
 
     clamped: np.ndarray
@@ -169,9 +177,14 @@ class Regions:
 class MeshQuality:
     """Shape of the worst elements.
 
-    min_dihedral : smallest dihedral angle [deg]
-    max_dihedral : largest dihedral angle [deg]
-    min_volume : smallest element volume over the mean one
+    Attributes
+    ----------
+    min_dihedral : float
+        Smallest dihedral angle [deg].
+    max_dihedral : float
+        Largest dihedral angle [deg].
+    min_volume : float
+        Smallest element volume over the mean one.
     """
 
     min_dihedral: float
@@ -254,7 +267,7 @@ def tetrahedralize(surface: SurfaceMesh, n_vertices: int = 2850) -> TetMesh:
 
 
 def _filled_out(mesh: TetMesh, surface: SurfaceMesh) -> TetMesh:
-    """The mesh with its boundary moved along its normals by the mean gap to the surface.
+    """Return the mesh with its boundary moved along its normals by the mean gap to the surface.
 
     Facets between points of a round surface cut corners: of a liver they lack half a per cent.
     """
@@ -297,25 +310,25 @@ def _fill(surface: SurfaceMesh, edge: float) -> TetMesh:
 
 
 def _single_faces(tets: np.ndarray) -> np.ndarray:
-    """4 element + face of the faces that one element alone has, ascending."""
+    """Return 4 element + face of the faces that one element alone has, ascending."""
     faces = np.sort(tets[:, _TET_FACES].reshape(-1, 3), axis=1)
     _, first, count = np.unique(faces, axis=0, return_index=True, return_counts=True)
     return np.sort(first[count == 1])
 
 
 def _largest_component(tets: np.ndarray) -> np.ndarray:
-    """Elements of the largest face-connected component."""
+    """Return the elements of the largest face-connected component."""
     label = components(tets)
     return tets[label == np.bincount(label).argmax()]
 
 
 def components(tets: np.ndarray) -> np.ndarray:
-    """Face-connected component of each element, shape (n_tets,)."""
+    """Return the face-connected component of each element, shape (n_tets,)."""
     return _components(tets[:, _TET_FACES])
 
 
 def _components(sides: np.ndarray) -> np.ndarray:
-    """Component of each element, shape (n,), by the sides that elements share.
+    """Return the component of each element, shape (n,), by the sides that elements share.
 
     sides : ndarray of int, shape (n, n_sides, n_corners)
     """
@@ -351,7 +364,7 @@ def regions_by_rule(
 def accessible_by_rule(
     mesh: TetMesh, covered: np.ndarray, anterior_cosine: float = 0.2
 ) -> np.ndarray:
-    """Faces that look forward and are not covered, without islands, shape (n_faces,)."""
+    """Return the faces that look forward and are not covered, without islands, shape (n_faces,)."""
     anterior = mesh.face_area_normals @ ANTERIOR > anterior_cosine * mesh.face_areas
     return without_islands(mesh.boundary_faces, mesh.face_areas, anterior & ~covered, least=0.05)
 
@@ -377,7 +390,7 @@ def without_islands(
 
 
 def checked(regions: Regions, on_supports: bool = False) -> Regions:
-    """The regions of an organ that is held, by a clamp unless it is on supports.
+    """Return the regions of an organ that is held, by a clamp unless it is on supports.
 
     Raises
     ------
@@ -392,7 +405,7 @@ def checked(regions: Regions, on_supports: bool = False) -> Regions:
 
 
 def quality(mesh: TetMesh) -> MeshQuality:
-    """Extreme dihedral angles and the smallest relative volume of a mesh."""
+    """Return the extreme dihedral angles and the smallest relative volume of a mesh."""
     corners = mesh.vertices[mesh.tets]
     normals = []
     for face in _TET_FACES:

@@ -25,7 +25,7 @@ MARGIN = 20e-3  # of the grid around the surface [m]; points beyond count as at 
 
 
 def exact_offsets(surface: Soup, points: np.ndarray) -> np.ndarray:
-    """q - c(q) of points (n, 3) from a surface, vertices (m, 3) and triangles (k, 3) [m]."""
+    """Return q - c(q) of points (n, 3) from a surface, vertices (m, 3) and triangles (k, 3) [m]."""
     return np.asarray(points - igl.point_mesh_squared_distance(points, *surface)[2])
 
 

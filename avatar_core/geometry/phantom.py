@@ -71,7 +71,7 @@ def phantom_liver(spacing: float = 7e-3) -> SurfaceMesh:
 
 
 def liver_level_set(points: FloatArray) -> FloatArray:
-    """Smooth function, negative inside the phantom, nearly its distance; shape (k,) [m]."""
+    """Return smooth function, negative inside the phantom, nearly its distance; shape (k,) [m]."""
     lobes = smooth_union(RIGHT_LOBE(points), LEFT_LOBE(points), width=0.030)
     visceral = half_space(points, VISCERAL_POINT, VISCERAL_NORMAL)
     body = -smooth_union(-lobes, -visceral, width=0.025)
@@ -79,13 +79,13 @@ def liver_level_set(points: FloatArray) -> FloatArray:
 
 
 def half_space(points: FloatArray, point: Vector, normal: Vector) -> FloatArray:
-    """Signed distance to a plane, positive on the side of its normal; shape (k,) [m]."""
+    """Return the signed distance to a plane, positive on the side of its normal; shape (k,) [m]."""
     direction = np.array(normal) / np.linalg.norm(normal)
     return (points - np.array(point)) @ direction
 
 
 def smooth_union(a: FloatArray, b: FloatArray, width: float) -> FloatArray:
-    """Minimum of two level sets, rounded where |a - b| < width [m] (quadratic blend)."""
+    """Return the minimum of two level sets, rounded where |a - b| < width [m] (quadratic blend)."""
     blend = np.maximum(width - np.abs(a - b), 0.0) / width
     return np.minimum(a, b) - blend**2 * width / 4.0
 
@@ -124,11 +124,15 @@ def project(points: FloatArray, level_set: LevelSet, step: float = 1e-5) -> Floa
 class ShapeMap:
     """Map of an organ onto a member of its population, x' = A (x + b(x)).
 
-    stretch : ndarray, shape (3,), diagonal of A (Eq. 17)
-    shear : ndarray, shape (3,), entries xy, xz, yz of A above the diagonal; below it are zeros
-    bend : ndarray, shape (6,), amplitudes [m] of b_i(x) = a (1 - cos(2 pi x_j / L)) for the
-        pairs (i, j) of axes: smooth, not affine, one-to-one if the two of each i
-        together stay below L / (2 pi)
+    Attributes
+    ----------
+    stretch : ndarray, shape (3,)
+        Diagonal of A (Eq. 17).
+    shear : ndarray, shape (3,)
+        Entries xy, xz, yz of A above the diagonal; below it are zeros.
+    bend : ndarray, shape (6,)
+        Amplitudes [m] of b_i(x) = a (1 - cos(2 pi x_j / L)) for the pairs (i, j) of axes: smooth,
+        not affine, one-to-one if the two of each i together stay below L / (2 pi).
     """
 
     stretch: FloatArray
@@ -150,20 +154,23 @@ class ShapeMap:
         return bent @ self.matrix.T
 
     def moved(self, surface: SurfaceMesh) -> SurfaceMesh:
-        """Image of a surface, triangle by triangle."""
+        """Return the image of a surface, triangle by triangle."""
         return replace(surface, vertices=self(surface.vertices))
 
 
 def population(n: int, seed: int, bend: float = 0.0) -> list[ShapeMap]:
-    """Random maps of Eq. 17 (six parameters, if bend > 0 twelve); longer lists begin alike.
+    """Return random maps of Eq. 17 (six parameters, if bend > 0 twelve); longer lists begin alike.
 
     Stretches 1.3^(u / 3) and shears 0.1 u, u uniform in [-1, 1]: the volume changes by det A,
     always under 30 %, the distortion is always under 10 %. (The paper prints the sum of the
     stretches for the volume gain; it is their product.)
 
-    bend : largest amplitude of each bend [m]
-
     Raises SurfaceError if the bends could fold the organ.
+
+    Parameters
+    ----------
+    bend : float
+        Largest amplitude of each bend [m].
     """
     if not 0.0 <= bend < BEND_LENGTH / (4 * np.pi):
         raise SurfaceError(

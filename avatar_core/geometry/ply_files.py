@@ -54,7 +54,7 @@ class _Element:
 
 
 def read_ply(content: bytes) -> Soup:
-    """Points (n, 3) and triangles (m, 3); polygons become fans, a cloud has no triangles.
+    """Return points (n, 3) and triangles (m, 3); polygons become fans, a cloud has no triangles.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def _points(columns: dict[str, NDArray[Any] | Cells]) -> FloatArray:
 
 
 def _parts(content: bytes) -> tuple[list[_Element], bytes]:
-    """Elements in their order, and the rows of all of them in binary."""
+    """Return the elements in their order, and the rows of all of them in binary."""
     begin = _HEAD.match(content)
     if begin is None:
         raise ValueError("it does not begin with a line 'ply'")
@@ -120,7 +120,7 @@ def _count(word: str) -> int:
 
 
 def _property(words: list[str], order: str, is_text: bool) -> _Property:
-    """A property from ``float x``, or from ``list uchar int vertex_indices``."""
+    """Return a property from ``float x``, or from ``list uchar int vertex_indices``."""
     kinds = words[1:-1] if words[0] == "list" else words[:-1]
     if len(kinds) != 1 + (words[0] == "list") or not all(kind in _TYPES for kind in kinds):
         raise ValueError(f"its property {' '.join(words)[:40]!r} is not read")
@@ -132,7 +132,7 @@ def _property(words: list[str], order: str, is_text: bool) -> _Property:
 
 
 def _rows(element: _Element, body: bytes, at: int) -> tuple[dict[str, NDArray[Any] | Cells], int]:
-    """Columns of an element that begins at a place in the body, and where it ends.
+    """Return the columns of an element that begins at a place in the body, and where it ends.
 
     A column is an array (n,) of numbers, or of lists where each begins and their corners.
     """
@@ -176,7 +176,7 @@ def _numbers(body: bytes, kind: np.dtype[Any], n: int, at: int) -> NDArray[Any]:
 
 
 def _named(element: _Element, columns: list[Any]) -> dict[str, NDArray[Any] | Cells]:
-    """Columns by name, of the rows' numbers of each property."""
+    """Return the columns by name, of the rows' numbers of each property."""
     named: dict[str, NDArray[Any] | Cells] = {}
     for one, rows in zip(element.properties, columns, strict=True):
         if one.count is None:
@@ -188,7 +188,7 @@ def _named(element: _Element, columns: list[Any]) -> dict[str, NDArray[Any] | Ce
 
 
 def _whole(numbers: NDArray[Any]) -> IntArray:
-    """Numbers as integers; ValueError if they are none."""
+    """Return the numbers as integers; ValueError if they are none."""
     with np.errstate(invalid="ignore"):
         found = numbers.astype(np.int64)
     if (found != numbers).any():

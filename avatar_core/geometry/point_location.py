@@ -13,7 +13,7 @@ _SLACK = 1e-9  # barycentric coordinates down to minus this count as inside
 
 
 def carriers(mesh: TetMesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Vertices of a mesh between which a field is interpolated linearly at points.
+    """Return the vertices of a mesh between which a field is interpolated linearly at points.
 
     Points in a tetrahedron take its barycentric coordinates, points outside those of the closest
     point of the surface, which has three corners: the last has no weight.
@@ -21,7 +21,8 @@ def carriers(mesh: TetMesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
     Returns
     -------
     corners : ndarray of int, shape (n, 4)
-    weights : ndarray, shape (n, 4), rows sum to one
+    weights : ndarray, shape (n, 4)
+        Rows sum to one.
     """
     tet, weights = locate(mesh, points)
     corners, outside = mesh.tets[tet].astype(np.int64), np.flatnonzero(tet < 0)
@@ -33,7 +34,7 @@ def carriers(mesh: TetMesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
 
 
 def locate(mesh: TetMesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Tetrahedra that hold points, and barycentric coordinates in them.
+    """Return the tetrahedra that hold points, and barycentric coordinates in them.
 
     Returns
     -------
@@ -61,13 +62,16 @@ def locate(mesh: TetMesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
 def closest_points(
     vertices: FloatArray, faces: IntArray, points: FloatArray
 ) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Closest points of a triangulation.
+    """Return the closest points of a triangulation.
 
     Returns
     -------
-    nearest : ndarray, shape (n, 3) [m]
-    face : ndarray of int, shape (n,), the faces they lie on
-    barycentric : ndarray, shape (n, 3), their coordinates there, rows sum to one
+    nearest : ndarray, shape (n, 3)
+        Nearest [m].
+    face : ndarray of int, shape (n,)
+        The faces they lie on.
+    barycentric : ndarray, shape (n, 3)
+        Their coordinates there, rows sum to one.
     """
     faces = faces.astype(np.int64)
     if len(points) == 0:

@@ -34,12 +34,20 @@ class Grading:
     h = max(core, inner min(rho, a)) + outer d at the distance rho from the axis, d being that from
     the disc of radius a: the contact is resolved at every radius, and what lies below it less.
 
-    point : ndarray, shape (3,) [m], the centre of the contact
-    axis : ndarray, shape (3,), unit
-    core : h at the centre [m]
-    radius : a, of the largest contact [m]
-    inner : growth of h over rho inside the disc
-    outer : growth of h over the distance from it
+    Attributes
+    ----------
+    point : ndarray, shape (3,)
+        Point [m], the centre of the contact.
+    axis : ndarray, shape (3,)
+        Unit.
+    core : float
+        h at the centre [m].
+    radius : float
+        a, of the largest contact [m].
+    inner : float
+        Growth of h over rho inside the disc.
+    outer : float
+        Growth of h over the distance from it.
     """
 
     point: np.ndarray
@@ -50,7 +58,7 @@ class Grading:
     outer: float = 0.35
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """h [m] at points x, shape (n, 3) [m]."""
+        """Return h [m] at points x, shape (n, 3) [m]."""
         offset = x - self.point
         z = offset @ self.axis
         rho = np.sqrt(np.maximum((offset**2).sum(axis=1) - z**2, 0.0))
@@ -69,9 +77,12 @@ def refine(
     Parameters
     ----------
     mesh : TetMesh
-    regions : Regions, of ``mesh``
-    gradings : of each contact; the least h counts
-    most_vertices : at which to give up
+    regions : Regions
+        Regions of ``mesh``.
+    gradings : Sequence[Grading]
+        Gradings of each contact; the least h counts.
+    most_vertices : int
+        Most vertices at which to give up.
 
     Raises
     ------
@@ -121,7 +132,7 @@ def _oriented(mesh: MeshTet) -> TetMesh:
 
 
 def _inherited(coarse: TetMesh, regions: Regions, fine: TetMesh) -> Regions:
-    """Regions of the coarse boundary faces, in which the fine ones lie."""
+    """Return the regions of the coarse boundary faces, in which the fine ones lie."""
     centroids = fine.vertices[fine.boundary_faces].mean(axis=1)
     faces = coarse.boundary_faces.astype(np.int64)
     parent = np.ravel(igl.point_mesh_squared_distance(centroids, coarse.vertices, faces)[1])
@@ -137,10 +148,14 @@ def onto_surface(mesh: TetMesh, surface: SurfaceMesh, point: np.ndarray, radius:
 
     Parameters
     ----------
-    mesh : TetMesh, fine against ``radius`` there
-    surface : SurfaceMesh, near the mesh's boundary
-    point : ndarray, shape (3,) [m]
-    radius : [m]
+    mesh : TetMesh
+        Fine against ``radius`` there.
+    surface : SurfaceMesh
+        Near the mesh's boundary.
+    point : ndarray, shape (3,)
+        Point [m].
+    radius : float
+        Radius [m].
 
     Raises
     ------
@@ -179,7 +194,7 @@ def _closest(surface: SurfaceMesh, points: np.ndarray) -> np.ndarray:
 
 
 def _beside(mesh: TetMesh, moved: np.ndarray, turned: np.ndarray) -> np.ndarray:
-    """The moved vertices within a tetrahedron's size of one that turned."""
+    """Return the moved vertices within a tetrahedron's size of one that turned."""
     corners = mesh.vertices[turned]
     center = corners.mean(axis=1)
     size = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
@@ -188,7 +203,7 @@ def _beside(mesh: TetMesh, moved: np.ndarray, turned: np.ndarray) -> np.ndarray:
 
 
 def _fading(x: np.ndarray) -> np.ndarray:
-    """1 up to 1, 0 from ``_FADE`` on, with a continuous slope between."""
+    """Return 1 up to 1, 0 from ``_FADE`` on, with a continuous slope between."""
     s = np.clip((_FADE - x) / (_FADE - 1.0), 0.0, 1.0)
     return np.asarray(s * s * (3.0 - 2.0 * s))
 

@@ -24,7 +24,7 @@ def require_displayable(n: int) -> None:
 
 
 def resampled(vertices: FloatArray, faces: IntArray, n: int) -> tuple[FloatArray, IntArray]:
-    """A surface with about n vertices: subdivided by Loop's scheme, then edges collapsed.
+    """Return a surface with about n vertices: subdivided by Loop's scheme, then edges collapsed.
 
     Loop's limit surface is smooth (Loop, 1987); edges collapse in the order of the quadric error
     (Garland & Heckbert, 1997). Both shrink a convex surface, so that its vertices are then moved
@@ -33,8 +33,10 @@ def resampled(vertices: FloatArray, faces: IntArray, n: int) -> tuple[FloatArray
 
     Parameters
     ----------
-    vertices, faces : of a closed surface, shapes (m, 3)
-    n : vertices wanted, fewer or more than the surface has
+    vertices, faces : ndarray
+        Vertices and faces of a closed surface, shapes (m, 3).
+    n : int
+        Vertices wanted, fewer or more than the surface has.
     """
     vertices, faces = np.ascontiguousarray(vertices, float), np.ascontiguousarray(faces, np.int64)
     manifold = is_manifold(faces)
@@ -55,7 +57,7 @@ def resampled(vertices: FloatArray, faces: IntArray, n: int) -> tuple[FloatArray
 
 
 def unified(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """Triangles whose corners coincide, made to share them."""
+    """Return the triangles whose corners coincide, made to share them."""
     index = weld(vertices)
     _, first = np.unique(index, return_index=True)
     shared = index[faces]
@@ -64,7 +66,7 @@ def unified(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray
 
 
 def is_manifold(faces: IntArray) -> bool:
-    """Whether two triangles meet on every edge, and one fan of them at every vertex."""
+    """Return whether two triangles meet on every edge, and one fan of them at every vertex."""
     faces = np.ascontiguousarray(faces, np.int64)
     closed = len(igl.boundary_facets(faces)[0]) == 0
     return bool(closed and igl.is_edge_manifold(faces)[0] and igl.is_vertex_manifold(faces).all())

@@ -32,19 +32,23 @@ BESIDE = 1e-4  # offset of the points tested on the two sides of a triangle [edg
 class Skin:
     """Boundary of the solid that a surface encloses.
 
-    covered : the surface and the cones over its holes, which decides what is inside
-    boundary : the triangles of it with inside on one side and outside on the other
+    Attributes
+    ----------
+    covered : Soup
+        The surface and the cones over its holes, which decides what is inside.
+    boundary : Soup
+        The triangles of it with inside on one side and outside on the other.
     """
 
     covered: Soup
     boundary: Soup
 
     def contains(self, points: FloatArray) -> NDArray[np.bool_]:
-        """Whether points lie inside, |w| > 1/2 whichever way the faces turn, shape (k,)."""
+        """Return whether points lie inside, |w| > 1/2 whichever way the faces turn, shape (k,)."""
         return _inside(self.covered, points)
 
     def signed_distance(self, points: FloatArray) -> FloatArray:
-        """Distance to the boundary, negative inside, shape (k,) [m].
+        """Return the distance to the boundary, negative inside, shape (k,) [m].
 
         Distance (AABB tree) and sign (winding number) are computed separately: pseudo-normals and
         rays give wrong signs on cracked surfaces.
@@ -73,20 +77,20 @@ def skin_of(vertices: FloatArray, faces: NDArray[Any], name: str = "surface") ->
 
 
 def weld(vertices: FloatArray, tolerance: float = 1e-7) -> IntArray:
-    """Index of the merged vertex of each vertex, shape (n,); tolerance x diagonal."""
+    """Return the index of the merged vertex of each vertex, shape (n,); tolerance x diagonal."""
     cell = tolerance * float(np.linalg.norm(np.ptp(vertices, axis=0))) or 1.0
     key = np.round((vertices - vertices.min(axis=0)) / cell).astype(np.int64)
     return np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 
 def directed_edges(triangles: NDArray[Any]) -> IntArray:
-    """Edges (from, to) of all faces without those of zero length, shape (<= 3 m, 2)."""
+    """Return the edges (from, to) of all faces without those of zero length, shape (<= 3 m, 2)."""
     edges = np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     return edges[edges[:, 0] != edges[:, 1]].astype(np.int64)
 
 
 def components(links: IntArray, n: int) -> IntArray:
-    """Number of the component of each of n vertices, shape (n,)."""
+    """Return the number of the component of each of n vertices, shape (n,)."""
     graph = coo_matrix((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
@@ -138,7 +142,7 @@ def _require_small(covered: Soup, n_vertices: int, n_faces: int, name: str) -> N
 
 
 def _unpaired(triangles: IntArray) -> tuple[IntArray, IntArray]:
-    """Directed edges that more faces run along one way than the other, and how many more."""
+    """Return directed edges that more faces run along one way than the other, and how many more."""
     directed = directed_edges(triangles)
     forth = np.where(directed[:, 0] < directed[:, 1], 1, -1)
     edges, number = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True)
@@ -177,7 +181,7 @@ def _boundary(soup: Soup) -> Soup:
 
 
 def _quartered(vertices: FloatArray, faces: IntArray) -> Soup:
-    """Every triangle split at the middles of its edges, which neighbours share.
+    """Return every triangle split at the middles of its edges, which neighbours share.
 
     Own code because igl.upsample aborts the process where many faces meet at one edge.
     """
@@ -207,6 +211,6 @@ def _inside(soup: Soup, points: FloatArray) -> NDArray[np.bool_]:
 
 
 def signed_volume(vertices: FloatArray, faces: NDArray[Any]) -> float:
-    """V = 1/6 sum a . (b x c) about the mean vertex, in the vertices' unit cubed."""
+    """Return V = 1/6 sum a . (b x c) about the mean vertex, in the vertices' unit cubed."""
     corners = vertices[faces] - vertices[faces].mean(axis=(0, 1))
     return float(np.sum(corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])) / 6)

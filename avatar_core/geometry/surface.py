@@ -249,7 +249,7 @@ def require_plausible_size(surface: SurfaceMesh) -> None:
 
 
 def ambiguous_fraction(surface: SurfaceMesh) -> float:
-    """Points with 0.25 < |w| < 0.75 over points with |w| > 0.5, away from the surface.
+    """Return the points with 0.25 < |w| < 0.75 over points with |w| > 0.5, away from the surface.
 
     0 for a closed surface, cracked or not; above 0.12 for livers cut in half; inf if nothing is
     inside.
@@ -261,7 +261,7 @@ def ambiguous_fraction(surface: SurfaceMesh) -> float:
 
 
 def winding_number(surface: SurfaceMesh, points: FloatArray) -> FloatArray:
-    """Generalised winding number of the surface at points, shape (k, 3) [m]; shape (k,).
+    """Return the generalised winding number of the surface at points, shape (k, 3) [m]; shape (k,).
 
     w(p) = 1/(4 pi) sum of solid angles: 1 inside, 0 outside, between them near a hole.
     """
@@ -284,7 +284,7 @@ def _is_plausible(extent: float) -> bool:
 
 
 def _unit_hint(largest: float, unit: str) -> str:
-    """Remedy for a size [m] that was read in the given unit."""
+    """Return the remedy for a size [m] that was read in the given unit."""
     raw = largest / METRES[unit]
     fitting = [other for other in METRES if _is_plausible(raw * METRES[other])]
     if fitting:
@@ -330,13 +330,13 @@ def _patch_labels(vertices: FloatArray, faces: NDArray[np.int32]) -> IntArray:
 
 
 def _rim(edges: IntArray) -> IntArray:
-    """Vertices on edges that belong to one face only."""
+    """Return the vertices on edges that belong to one face only."""
     unique, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
     return np.unique(unique[counts == 1])
 
 
 def _patch_volumes(surface: SurfaceMesh, labels: IntArray) -> FloatArray:
-    """|Signed volume| of each component about its own centre [m3]."""
+    """Return |Signed volume| of each component about its own centre [m3]."""
     parts = [surface.faces[labels == k] for k in range(labels.max() + 1)]
     return np.array([abs(signed_volume(surface.vertices, part)) for part in parts])
 
@@ -356,7 +356,7 @@ def _require_one_body(
 
 
 def _overlap(one: SurfaceMesh, other: SurfaceMesh) -> bool:
-    """Whether a vertex of either surface lies inside the other."""
+    """Return whether a vertex of either surface lies inside the other."""
     return any(
         bool(np.any(np.abs(winding_number(a, b.vertices[np.unique(b.faces)])) > 0.5))
         for a, b in ((one, other), (other, one))
@@ -366,7 +366,7 @@ def _overlap(one: SurfaceMesh, other: SurfaceMesh) -> bool:
 def _with_faces(
     surface: SurfaceMesh, faces: NDArray[np.int32], notice: str | None = None
 ) -> SurfaceMesh:
-    """The surface with these faces only, unused vertices removed."""
+    """Return the surface with these faces only, unused vertices removed."""
     used, inverse = np.unique(faces, return_inverse=True)
     return replace(
         surface,
@@ -390,7 +390,7 @@ def _winding_volume(surface: SurfaceMesh, n: int = 48) -> float:
 
 
 def box_points(low: FloatArray, high: FloatArray, shape: Iterable[int]) -> FloatArray:
-    """Centres of the cells of a box divided into shape cells, shape (product, 3)."""
+    """Return the centres of the cells of a box divided into shape cells, shape (product, 3)."""
     axes = [
         a + (b - a) * (np.arange(n) + 0.5) / n for a, b, n in zip(low, high, shape, strict=True)
     ]
@@ -405,7 +405,7 @@ def _int64(faces: NDArray[Any]) -> IntArray:
 
 
 def axes_matrix(axes: str | ArrayLike) -> FloatArray:
-    """Rigid map (4, 4) from the file's axes to RAS, from a name such as "LPS" or a matrix.
+    """Return rigid map (4, 4) from the file's axes to RAS, from a name such as "LPS" or a matrix.
 
     Raises SurfaceError for an unknown name or a matrix that is not a rotation or mirror.
     """
@@ -425,7 +425,7 @@ def axes_matrix(axes: str | ArrayLike) -> FloatArray:
 
 
 def _contradictions(axes: FloatArray, stated: str | None, path: Path) -> tuple[str, ...]:
-    """A notice if axes (4, 4) turn the file otherwise than it states."""
+    """Return a notice if axes (4, 4) turn the file otherwise than it states."""
     if stated is None or np.allclose(axes[:3, :3], _named_axes(stated), atol=1e-4):
         return ()
     where = f"the file's header states {stated} (SPACE={stated})"

@@ -39,8 +39,12 @@ HEADER_BYTES = 1 << 16  # of a file in which its axes are looked for
 class Format:
     """How one format of meshes is read.
 
-    read : vertices (n, 3) and triangles (m, 3) of a file's content
-    comments : the part of a file's head that may state its axes; None if the format has none
+    Attributes
+    ----------
+    read : Callable[[bytes], Soup]
+        Vertices (n, 3) and triangles (m, 3) of a file's content.
+    comments : Callable[[bytes], bytes] or None
+        The part of a file's head that may state its axes; None if the format has none.
     """
 
     read: Callable[[bytes], Soup]
@@ -48,7 +52,7 @@ class Format:
 
 
 def content_of(path: Path) -> bytes:
-    """The file's bytes, for its hash; SurfaceError if there is no such ordinary file."""
+    """Return the file's bytes, for its hash; SurfaceError if there is no such ordinary file."""
     with _naming(path), files.opened(path, MAX_FILE_BYTES) as source:
         return files.content_of(source)
 
@@ -65,7 +69,7 @@ def _naming(path: Path) -> Iterator[None]:
 
 
 def stated_axes(path: Path) -> str | None:
-    """The axes that a file's header states, "RAS" or "LPS"; None if it states none.
+    """Return the axes that a file's header states, "RAS" or "LPS"; None if it states none.
 
     3D Slicer writes ``SPACE=LPS`` or ``SPACE=RAS`` into the header of STL, the comments of OBJ and
     PLY, and the title of legacy VTK, and ``LPS`` or ``RAS`` as the field ``SPACE`` of VTK's XML,
@@ -103,19 +107,19 @@ def _stl_comments(head: bytes) -> bytes:
 
 
 def _vtk_comments(head: bytes) -> bytes:
-    """The title, which is the second line."""
+    """Return the title, which is the second line."""
     return b"".join(head.splitlines()[1:2])
 
 
 def _vtp_comments(content: bytes) -> bytes:
-    """The field of that name; nothing of a file that is refused later, when it is read."""
+    """Return the field of that name; nothing of a file that is refused later, when it is read."""
     with suppress(Exception):
         return f"SPACE={stated_axes_of(content)}".encode()
     return b""
 
 
 def parse(path: Path, label: int | str | None = None) -> Soup:
-    """Vertices (n, 3) in the file's unit and axes, and triangles (m, 3)."""
+    """Return the vertices (n, 3) in the file's unit and axes, and triangles (m, 3)."""
     return parsed(path, label)[0]
 
 
@@ -126,7 +130,7 @@ def parsed(
     is_organ: bool = True,
     mm: float = 1.0,
 ) -> tuple[Soup, tuple[str, ...]]:
-    """The result of :func:`parse`, and notices of a label map.
+    """Return the result of :func:`parse`, and notices of a label map.
 
     label, inside, is_organ, mm : as of :func:`avatar_core.geometry.label_maps.surface_of_label`
     """
@@ -147,7 +151,7 @@ def parsed(
 
 
 def _read_obj(content: bytes) -> Soup:
-    """Wavefront OBJ: v, and f in all its forms (a, a/b, a//c, a/b/c, -1, polygons)."""
+    """Return the Wavefront OBJ: v, and f in all its forms (a, a/b, a//c, a/b/c, -1, polygons)."""
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
     for line in content.decode("utf-8", errors="replace").splitlines():
@@ -169,7 +173,7 @@ def _fan(polygons: Iterable[Iterable[int]]) -> IntArray:
 
 
 def _read_stl(content: bytes) -> Soup:
-    """Binary STL, whatever lies behind its last triangle, and text."""
+    """Return the binary STL, whatever lies behind its last triangle, and text."""
     n = int.from_bytes(content[80:84], "little")
     if 0 < 84 + 50 * n <= len(content):  # a text would have to be of gigabytes
         record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -185,7 +189,7 @@ def _read_stl(content: bytes) -> Soup:
 
 
 def _read_off(content: bytes) -> Soup:
-    """OFF in text, with or without colours, normals and texture (COFF, NOFF, STOFF)."""
+    """Return OFF in text, with or without colours, normals and texture (COFF, NOFF, STOFF)."""
     text = content.decode("utf-8", errors="replace")
     begin = re.match(r"\s*(ST)?C?N?OFF(?![A-Za-z])", text)
     if begin is None or "BINARY" in text[: begin.end() + 10]:

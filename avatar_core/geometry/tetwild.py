@@ -112,7 +112,7 @@ def _failure(run: subprocess.CompletedProcess[str]) -> MeshError:
 
 @cache
 def _compiled() -> str:
-    """Path of the compiled module; MeshError if there is none for this Python."""
+    """Return the path of the compiled module; MeshError if there is none for this Python."""
     package = find_spec("pytetwild")  # this does not import it
     folders = package.submodule_search_locations if package else None
     found = PathFinder.find_spec("PyfTetWildWrapper", folders) if folders else None

@@ -76,7 +76,7 @@ def _replace_import(library: str, symbol: bytes, function: Any) -> bool:
 
 
 def _imports(file: np.ndarray, symbol: bytes) -> list[int]:
-    """Offsets, from where the library is loaded, of the pointers to an imported function."""
+    """Return offsets, from where the library is loaded, of the pointers to an imported function."""
 
     def table(section: np.void, dtype: np.dtype[Any]) -> np.ndarray:
         count = int(section["size"]) // dtype.itemsize
@@ -98,7 +98,7 @@ def _imports(file: np.ndarray, symbol: bytes) -> list[int]:
 
 
 def _base(library: str) -> int:
-    """Address that a library is loaded at."""
+    """Return the address that a library is loaded at."""
     path = os.path.realpath(library)
     with open("/proc/self/maps") as maps:
         return next(int(line.split("-")[0], 16) for line in maps if line.rstrip().endswith(path))

@@ -34,7 +34,7 @@ def read_tumour(
 
 
 def volume_fraction_inside(mesh: TetMesh, tumour: SurfaceMesh) -> np.ndarray:
-    """Volume fraction of each tetrahedron inside a tumour, shape (n_tets,).
+    """Return the volume fraction of each tetrahedron inside a tumour, shape (n_tets,).
 
     Counted on a lattice of points in each tetrahedron near it.
 
@@ -81,10 +81,14 @@ def strained_fraction(
 
     Parameters
     ----------
-    points : ndarray, shape (n, 3), on the surface [m]
-    normals : ndarray, shape (n, 3), unit vectors, outward
-    radius : of the contact [m]
-    reach : distance beyond which energy does not count [m]
+    points : ndarray, shape (n, 3)
+        Points on the surface [m].
+    normals : ndarray, shape (n, 3)
+        Unit vectors, outward.
+    radius : float
+        Radius of the contact [m].
+    reach : float
+        Distance beyond which energy does not count [m].
 
     Returns
     -------
@@ -108,7 +112,8 @@ def strained_fraction(
 
 def _beneath(radius: float, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Directions that stand for equal energies (k, 3), the last component inward; distances (m,)
-    [m] and their weights, which sum to one."""
+    [m] and their weights, which sum to one.
+    """
     cosine = ((np.arange(_POLAR) + 0.5) / _POLAR) ** (1.0 / 3.0)  # of the density cos^2
     angle = 2.0 * np.pi * (np.arange(_AZIMUTHS) + 0.5) / _AZIMUTHS
     c, a = (each.ravel() for each in np.meshgrid(cosine, angle))
@@ -122,7 +127,7 @@ def _beneath(radius: float, reach: float) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def _lattice() -> np.ndarray:
-    """Barycentric coordinates of points that stand for equal volumes, shape (n, 4)."""
+    """Return the barycentric coordinates of points that stand for equal volumes, shape (n, 4)."""
     n = _LATTICE
     counts = np.array([c for c in np.ndindex(n, n, n) if sum(c) < n])
     last = n - 1 - counts.sum(axis=1, keepdims=True)

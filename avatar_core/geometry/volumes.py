@@ -32,10 +32,15 @@ class Segment:
 class Volume:
     """Layers of voxels.
 
+    Attributes
+    ----------
     values : ndarray, shape (n_layers, nx, ny, nz)
-    affine : ndarray, shape (4, 4), from indices to RAS [mm]
-    segments : that the file names
-    notices : what the file leaves open or contradicts, one line each
+    affine : ndarray, shape (4, 4)
+        Affine from indices to RAS [mm].
+    segments : tuple[Segment, ...]
+        Segments that the file names.
+    notices : tuple[str, ...]
+        What the file leaves open or contradicts, one line each.
     """
 
     values: NDArray[Any]
@@ -45,7 +50,7 @@ class Volume:
 
 
 def require_loadable(name: str, shape: Sequence[int], item: int) -> int:
-    """Bytes of an array; SurfaceError if they are too many."""
+    """Return the bytes of an array; SurfaceError if they are too many."""
     n_bytes = item * int(np.prod(np.array(shape, dtype=object)))
     if not 0 < n_bytes <= MAX_VOXEL_BYTES:
         raise SurfaceError(

@@ -192,14 +192,14 @@ class _Reader:
     # --- words and numbers ----------------------------------------------------------------------
 
     def _line(self) -> bytes:
-        """The rest of this line without its end; empty at the end of the file."""
+        """Return the rest of this line without its end; empty at the end of the file."""
         end = self._content.find(b"\n", self._at)
         end = len(self._content) if end < 0 else end
         line, self._at = self._content[self._at : end], end + 1
         return line
 
     def _word(self) -> str:
-        """The next word in capitals; empty at the end of the file."""
+        """Return the next word in capitals; empty at the end of the file."""
         match = _WORD.search(self._content, self._at)
         if match is None:
             return ""
@@ -207,7 +207,7 @@ class _Reader:
         return match[0].decode("latin-1").upper()
 
     def _peek(self) -> str:
-        """The next word, which is read again."""
+        """Return the next word, which is read again."""
         before = self._at
         word = self._word()
         self._at = before
@@ -308,7 +308,7 @@ def _windows(starts: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def fans(starts: IntArray, corners: IntArray) -> IntArray:
-    """Polygons as triangles about their first corners, shape (m, 3)."""
+    """Return the polygons as triangles about their first corners, shape (m, 3)."""
     first, place = _windows(starts)
     return corners[np.column_stack([first, first + place + 1, first + place + 2])]
 

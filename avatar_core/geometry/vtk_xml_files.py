@@ -108,7 +108,7 @@ class _File:
         return starts, corners
 
     def numbers(self, array: Element) -> NDArray[Any]:
-        """The numbers of an array, shape (n,)."""
+        """Return the numbers of an array, shape (n,)."""
         kind = np.dtype(self._order + _TYPES[array.get("type", "")])
         form, text = array.get("format"), (array.text or "").strip()
         if form == "ascii":
@@ -122,7 +122,7 @@ class _File:
         return np.frombuffer(self._bytes(data, self._is_raw and form == "appended"), kind)
 
     def _bytes(self, data: bytes, is_raw: bool) -> bytes:
-        """The bytes of an array behind its sizes."""
+        """Return the bytes of an array behind its sizes."""
         compressor = self._root.get("compressor")
         if compressor is None:
             (n_bytes,) = self._sizes(data, 1, is_raw)
@@ -144,12 +144,12 @@ class _File:
 
 
 def _n_letters(n_bytes: int) -> int:
-    """Length of so many bytes in base64."""
+    """Return the length of so many bytes in base64."""
     return -(-n_bytes // 3) * 4
 
 
 def _part(data: bytes, start: int, n: int, is_raw: bool) -> bytes:
-    """``n`` bytes from ``start`` on, of what is raw or in base64."""
+    """Return ``n`` bytes from ``start`` on, of what is raw or in base64."""
     end = start + n
     part = data[:end] if is_raw else base64.b64decode(data[: _n_letters(end)])[:end]
     if len(part) < end:
@@ -158,7 +158,7 @@ def _part(data: bytes, start: int, n: int, is_raw: bool) -> bytes:
 
 
 def _unpacked(block: bytes, size: int, compressor: str) -> bytes:
-    """A block that holds ``size`` bytes."""
+    """Return a block that holds ``size`` bytes."""
     if size > _MOST * (len(block) + 64):
         raise ValueError("a block claims more than it can hold")
     if size == 0:  # to a decompressor, no limit

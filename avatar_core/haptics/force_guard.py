@@ -60,8 +60,12 @@ DEVICES = {
 class ForceGuard:
     """The force on one tool, limited in every period.
 
-    sent_fraction : |F| / |f|, of the organ's force that is sent; 1 if that is zero
-    limited : whether a limit is active
+    Parameters
+    ----------
+    sent_fraction
+        |F| / |f|, of the organ's force that is sent; 1 if that is zero.
+    limited
+        Whether a limit is active.
     """
 
     def __init__(self, limits: ForceLimits) -> None:
@@ -89,7 +93,12 @@ class ForceGuard:
 
         Real-time safe: neither raises nor blocks. A force that is not finite is a fault.
 
-        now : any steady clock [s]; sound : whether the tool's pose is valid
+        Parameters
+        ----------
+        now : float
+            Any steady clock [s].
+        sound : bool
+            Whether the tool's pose is valid.
         """
         period, self._last = min(max(now - self._last, 0.0), _LONGEST), now
         x, y, z = float(force[0]), float(force[1]), float(force[2])

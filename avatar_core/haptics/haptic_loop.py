@@ -35,7 +35,7 @@ class Device:
     grip: float = 0.0
 
     def transition(self, period: float = PERIOD) -> tuple[FloatArray, FloatArray]:
-        """(x, v) after a period: A (x, v) + B force, shapes (2, 2) and (2,)."""
+        """Return (x, v) after a period: A (x, v) + B force, shapes (2, 2) and (2,)."""
         rate = np.zeros((3, 3))
         rate[0, 1] = 1.0
         rate[1] = np.array([-self.grip, -self.damping, 1.0]) / self.mass
@@ -47,8 +47,14 @@ class Device:
 class Loop:
     """A device on an organ.
 
-    stiffness : of the organ [N/m]; delay : of the force [periods]
-    resolution : quantisation step of the pose [m]
+    Attributes
+    ----------
+    stiffness : float
+        Stiffness of the organ [N/m].
+    delay : int
+        Delay of the force [periods].
+    resolution : float
+        Quantisation step of the pose [m].
     """
 
     device: Device
@@ -60,9 +66,14 @@ class Loop:
 class Trace(NamedTuple):
     """The course of a loop, period by period.
 
-    position : x before each period [m]
-    organ, held : the organ's force at x, and F, which acts on the tool [N]
-    energy : that the tool has put into the port, after each period [J]
+    Attributes
+    ----------
+    position : ndarray
+        x before each period [m].
+    organ, held : ndarray
+        The organ's force at x, and F, which acts on the tool [N].
+    energy : ndarray
+        Energy that the tool has put into the port, after each period [J].
     """
 
     position: FloatArray
@@ -74,7 +85,7 @@ class Trace(NamedTuple):
 def run_loop(
     loop: Loop, push: FloatArray, start: float = 0.0, passivity: Passivity | None = None
 ) -> Trace:
-    """The loop from rest at ``start`` under the operator's push, shape (n_periods,) [N]."""
+    """Return the loop from rest at ``start`` under the operator's push, shape (n_periods,) [N]."""
     trace = Trace(*(np.zeros(len(push)) for _ in Trace._fields))
     transition = loop.device.transition(PERIOD)
     _run(*transition, loop.stiffness, loop.delay, loop.resolution, push, start, passivity, trace)
@@ -84,14 +95,14 @@ def run_loop(
 def oscillation_growth(
     loop: Loop, depth: float = 5e-3, offset: float = 1e-3, n: int = 4000
 ) -> float:
-    """Growth of an oscillation about a constant push: its last peaks over its first ones."""
+    """Return growth of an oscillation about a constant push: its last peaks over its first ones."""
     push = np.full(n, -loop.stiffness * depth)
     deviation = np.abs(run_loop(loop, push, offset - depth).position + depth)
     return float(deviation[-n // 4 :].max() / deviation[: n // 4].max())
 
 
 def stability_border(stiffness: float, delay: int, mass: float = 1.0) -> float:
-    """Damping of a tool without grip at which oscillations neither grow nor decay [N s/m].
+    """Return damping of a tool without grip at which oscillations neither grow nor decay [N s/m].
 
     By bisection to 0.1 %; near K (T / 2 + delay T) if m is large (Gil et al., J. Comput. Inf. Sci.
     Eng. 9:011005, 2009), as is the damping that passivity requires (Colgate & Schenkel, J. Robotic
@@ -115,7 +126,7 @@ def stability_border(stiffness: float, delay: int, mass: float = 1.0) -> float:
 
 
 def expected_border(stiffness: float, delay: int) -> float:
-    """K (T / 2 + delay T) [N s/m]."""
+    """Return K (T / 2 + delay T) [N s/m]."""
     return stiffness * PERIOD * (0.5 + delay)
 
 

@@ -81,18 +81,25 @@ def make_passivity(
     tolerance: float = 1e-5,
     damping: float = 10.0,
 ) -> Passivity:
-    """State without any tool or energy.
+    """Return the state without any tool or energy.
 
     Parameters
     ----------
     n_tools : int
-    delay : periods from the pose to the moment from which its force is held, known and constant
-    resolution : step of the readings of a coordinate, 0 if they are exact [m]
-    period : T, of the loop and of the hold [s]
-    stiffness, speed : K and v, for the bound; an infinite stiffness for none [N/m], [m/s]
-    acceleration : a, largest of a tool, for which the bound is certain [m/s^2]
-    tolerance : energy that the loop may generate before it is damped [J]
-    damping : largest added; below m / ((delay + 1) T) of the lightest tool, m [N s/m]
+    delay : int
+        Periods from the pose to the moment from which its force is held, known and constant.
+    resolution : float
+        Step of the readings of a coordinate, 0 if they are exact [m].
+    period : float
+        T, of the loop and of the hold [s].
+    stiffness, speed : float
+        K and v, for the bound; an infinite stiffness for none [N/m], [m/s].
+    acceleration : float
+        a, largest of a tool, for which the bound is certain [m/s^2].
+    tolerance : float
+        Energy that the loop may generate before it is damped [J].
+    damping : float
+        Largest added; below m / ((delay + 1) T) of the lightest tool, m [N s/m].
 
     Raises
     ------
@@ -170,7 +177,7 @@ def limit(passivity, tips, force):  # type: ignore[no-untyped-def]
 
 @inlined
 def _move(passivity, t, tip):  # type: ignore[no-untyped-def]
-    """d = x_k - x_k-1; returns |d|^2."""
+    """Return d = x_k - x_k-1; returns |d|^2."""
     square = 0.0
     for d in range(3):
         passivity.moved[t, d] = tip[d] - passivity.tip[t, d]

@@ -22,8 +22,10 @@ class Shedder:
 
     Parameters
     ----------
-    levels : numbers of modes, the largest for a machine that is not overloaded
-    deadline : of a step [s]; infinity for none
+    levels : Sequence[int]
+        Numbers of modes, the largest for a machine that is not overloaded.
+    deadline : float
+        Deadline of a step [s]; infinity for none.
     """
 
     def __init__(self, levels: Sequence[int], deadline: float = float("inf")) -> None:
@@ -45,12 +47,14 @@ class Shedder:
         return self._level < len(self._levels) - 1
 
     def update(self, missed: float, step_p99: float) -> int:
-        """Modes to show after a window. Real-time safe, though meant for once a window.
+        """Return the modes to show after a window. Real-time safe, though meant for once a window.
 
         Parameters
         ----------
-        missed : fraction of its periods that were missed
-        step_p99 : 99th percentile of its steps' times [s]; NaN of none
+        missed : float
+            Fraction of its periods that were missed.
+        step_p99 : float
+            99th percentile of its steps' times [s]; NaN of none.
         """
         if missed > OVERLOADED or step_p99 > self._deadline:
             self._shed()
@@ -65,7 +69,7 @@ class Shedder:
         return self.modes
 
     def rest(self) -> int:
-        """All modes again, after a window in which nobody looked."""
+        """Return all modes again, after a window in which nobody looked."""
         self._level, self._calm, self._restored = len(self._levels) - 1, 0, False
         return self.modes
 

@@ -23,9 +23,14 @@ _BATCH = 80  # load positions solved at once: fewer take longer each
 class FullResponse:
     """The response to every load, in single precision.
 
-    columns : ndarray, shape (3 n_vertices, n_loads), displacement at the vertices [m/N]
-    compliance : ndarray, shape (n_loads, n_loads), of patch under patch, symmetric [m/N]
-    norm : ndarray, shape (n_loads,), mass-weighted L2 norm of each column [m^(5/2)/N]
+    Attributes
+    ----------
+    columns : ndarray, shape (3 n_vertices, n_loads)
+        Displacement at the vertices [m/N].
+    compliance : ndarray, shape (n_loads, n_loads)
+        Compliance of patch under patch, symmetric [m/N].
+    norm : ndarray, shape (n_loads,)
+        Mass-weighted L2 norm of each column [m^(5/2)/N].
     """
 
     columns: np.ndarray
@@ -44,7 +49,7 @@ class FullResponse:
         return (self.columns[:, loads] - smooth).reshape(len(smooth), -1, 3)
 
     def errors(self, blocks: Blocks, field: BlockField, mass: np.ndarray) -> np.ndarray:
-        """Relative L2 errors of a field under each load, shape (n_loads,).
+        """Return the relative L2 errors of a field under each load, shape (n_loads,).
 
         mass : ndarray, shape (3 n_vertices,), lumped
         """
@@ -97,7 +102,7 @@ def _symmetrize(matrix: np.ndarray) -> None:
 
 
 def contact_blocks(response: FullResponse, surface: LoadSurface, support: float) -> LocalBlocks:
-    """The compliance between load positions up to a distance [m] apart."""
+    """Return the compliance between load positions up to a distance [m] apart."""
     pairs = near_pairs(surface.centers, surface.centers, support)
     exact = response.compliance.reshape(surface.n_positions, 3, surface.n_positions, 3)
     blocks = np.empty((len(pairs.target), 3, 3), np.float32)
@@ -110,7 +115,7 @@ def contact_blocks(response: FullResponse, surface: LoadSurface, support: float)
 def contact_near(
     exact: LocalBlocks, load: np.ndarray, surface: LoadSurface, support: float
 ) -> LocalBlocks:
-    """(C - Y Y^T), tapered up to a distance and exactly symmetric.
+    """Return (C - Y Y^T), tapered up to a distance and exactly symmetric.
 
     exact : of :func:`contact_blocks`
     load : ndarray, shape (n_loads, rank), Y
@@ -121,7 +126,7 @@ def contact_near(
 
 
 def remainder(exact: LocalBlocks, load: np.ndarray, fade: np.ndarray) -> LocalBlocks:
-    """(C - Y Y^T) of blocks of a compliance, times a factor of each block."""
+    """Return (C - Y Y^T) of blocks of a compliance, times a factor of each block."""
     load = load.reshape(len(load) // 3, 3, load.shape[1])
     block = np.empty(exact.block.shape, np.float32)
     for j in range(len(exact.start) - 1):
@@ -132,7 +137,7 @@ def remainder(exact: LocalBlocks, load: np.ndarray, fade: np.ndarray) -> LocalBl
 
 
 def _symmetrized(blocks: LocalBlocks) -> LocalBlocks:
-    """(B + B^T) / 2 block by block: rounding is all it removes (Maxwell-Betti)."""
+    """Return (B + B^T) / 2 block by block: rounding is all it removes (Maxwell-Betti)."""
     order = np.lexsort((blocks.position, blocks.target))  # the transpose, in the same pattern
     mean = 0.5 * (blocks.block + blocks.block[order].transpose(0, 2, 1))
     return replace(blocks, block=mean)

@@ -183,7 +183,7 @@ def _left(size: FloatArray) -> FloatArray:
 
 
 def _linear_depth(beta: FloatArray, rule: LargeRule) -> float:
-    """a at which the depth is ``max_push``, or less where the organ hardly resists."""
+    """Return a at which the depth is ``max_push``, or less where the organ hardly resists."""
     a = np.linspace(0.0, 1.5 * rule.max_push, 301)
     order = np.arange(1, _ORDER + 1)
     depth = a[:, None] ** order @ beta

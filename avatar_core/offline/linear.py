@@ -53,9 +53,14 @@ _RANK_STEP = 5  # between the numbers of modes whose errors are reported
 class Modes:
     """K-orthonormal modes of all loads, sorted by displacement norm.
 
-    space : ndarray, shape (3 n_nodes, rank), X
-    load : ndarray, shape (n_loads, rank), Y = F^T X
-    history : of the enrichments
+    Attributes
+    ----------
+    space : ndarray, shape (3 n_nodes, rank)
+        X.
+    load : ndarray, shape (n_loads, rank)
+        Y = F^T X.
+    history : tuple[EnrichmentReport, ...]
+        History of the enrichments.
     """
 
     space: np.ndarray
@@ -141,7 +146,7 @@ def find_modes(
     n_modes: int,
     progress: Progress,
 ) -> Modes:
-    """PGD in the energy norm of loads that are solved.
+    """Return the PGD in the energy norm of loads that are solved.
 
     Every load is divided by its own L2 norm, so that the relative error of a load at a stiff place
     counts as much as that at a soft one. PGD of many loads works in single precision; its modes
@@ -169,7 +174,7 @@ def find_modes(
 def _with_body(
     elasticity: Elasticity, loads: sp.csr_matrix, modes: Modes, n_global: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The first modes and after them the body's functions, which hold all of its sag.
+    """Return the first modes and after them the body's functions, which hold all of its sag.
 
     Returns
     -------
@@ -210,12 +215,12 @@ def modes_of_regions(
 
 
 def _half(progress: Progress, k: int) -> Progress:
-    """Progress of the first or the second half of a stage."""
+    """Return the progress of the first or the second half of a stage."""
     return lambda stage, fraction, error: progress(stage, 0.5 * (k + fraction), error)
 
 
 def rank_errors(n_global: int, errors: np.ndarray) -> tuple[RankError, ...]:
-    """Mean and worst of errors (n_modes + 1, ...) by number of modes at a place."""
+    """Return the mean and worst of errors (n_modes + 1, ...) by number of modes at a place."""
     last = len(errors) - 1
     return tuple(
         RankError(n_global + k, float(errors[k].mean()), float(errors[k].max()))

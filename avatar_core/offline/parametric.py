@@ -110,8 +110,9 @@ def build_parametric_vademecum(
 
     Parameters
     ----------
-    elasticity : with an element that serves the whole range, and the inclusion if the contrast
-        is a coordinate
+    elasticity : Elasticity
+        Elasticity with an element that serves the whole range, and the inclusion if the contrast is
+        a coordinate.
     """
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
     nodes = node_values(coordinates)
@@ -128,7 +129,7 @@ def build_parametric_vademecum(
 
 
 def _part(progress: Progress, k: int, nodes: Sequence[object]) -> Progress:
-    """Progress of one node's solutions as a part of all."""
+    """Return the progress of one node's solutions as a part of all."""
     return lambda stage, fraction, error: progress(stage, (k + fraction) / len(nodes), error)
 
 
@@ -139,7 +140,7 @@ def _solved(
     rule: BuildRule,
     progress: Progress,
 ) -> _Snapshot:
-    """All patches at one node, and the modes there."""
+    """Return all patches at one node, and the modes there."""
     half = 0.5
 
     def first(stage: str, fraction: float, error: float) -> None:
@@ -163,7 +164,7 @@ def _solved(
 
 
 def _principal(snapshots: Sequence[_Snapshot], rule: BuildRule) -> np.ndarray:
-    """Principal space functions over all nodes and loads, shape (3 n_nodes, n).
+    """Return the principal space functions over all nodes and loads, shape (3 n_nodes, n).
 
     With X the modes of all nodes side by side, X^T M X = A^T A, and Y block-diagonal with
     Y^T W Y = B^T B, these are X B^T R for the leading R in A B^T = P S R^T.
@@ -185,7 +186,7 @@ def _principal(snapshots: Sequence[_Snapshot], rule: BuildRule) -> np.ndarray:
 
 
 def _beside(space: np.ndarray, sags: np.ndarray, mass: np.ndarray) -> np.ndarray:
-    """Functions of what a space leaves of sags, (3 n_nodes, n): surface loads hold 95 %."""
+    """Return functions of what a space leaves of sags, (3 n_nodes, n): surface loads hold 95 %."""
     n = len(mass)  # vertices alone are weighted
     root = np.sqrt(mass)[:, None]
     sags = sags / np.linalg.norm(root * sags[:n], axis=0)
@@ -197,7 +198,7 @@ def _beside(space: np.ndarray, sags: np.ndarray, mass: np.ndarray) -> np.ndarray
 def _project(
     snapshots: Sequence[_Snapshot], space: np.ndarray, loads: sp.csr_matrix, rule: BuildRule
 ) -> GalerkinBasis:
-    """Galerkin projection of every term of the stiffness."""
+    """Return the Galerkin projection of every term of the stiffness."""
     middle = snapshots[len(snapshots) // 2].elasticity
     space = space.astype(float)
     operators = _projected_terms(middle, space)
@@ -227,7 +228,7 @@ def _project(
 def _body_among_first(
     body: BodyResponse, sags: np.ndarray, n_global: int
 ) -> tuple[np.ndarray, int]:
-    """A rotation of a basis by which the functions of the body complete its first, (n, n).
+    """Return a rotation of a basis by which the functions of the body complete its first, (n, n).
 
     Returns the number of the first too, as some functions of the body may depend on others.
     """
@@ -364,7 +365,7 @@ def _separated(
 
 
 def _errors(organ: _Organ, snapshots: Sequence[_Snapshot], field: BlockField) -> np.ndarray:
-    """Relative L2 errors of a field, its loads those of all nodes, under each of them."""
+    """Return relative L2 errors of a field, its loads those of all nodes, under each of them."""
     mass, out = organ.elasticity.mesh.lumped_mass, []
     for k, snapshot in enumerate(snapshots):
         own = replace(field, load=field.load[:, 3 * k : 3 * k + 3])
@@ -375,7 +376,7 @@ def _errors(organ: _Organ, snapshots: Sequence[_Snapshot], field: BlockField) ->
 def _coefficients(
     space: np.ndarray, regions: Sequence[RegionModes], mass: np.ndarray
 ) -> np.ndarray:
-    """Functions (3 n_vertices, n) in the modes of each region, which are mass-orthogonal.
+    """Return functions (3 n_vertices, n) in the modes of each region, which are mass-orthogonal.
 
     Returns
     -------
@@ -391,7 +392,7 @@ def _coefficients(
 
 
 def _inside(coordinates: Sequence[Coordinate], elasticity: Elasticity) -> dict[str, float]:
-    """The values of a problem, moved into the ranges of the coordinates."""
+    """Return the values of a problem, moved into the ranges of the coordinates."""
     inclusion = elasticity.inclusion
     here = {
         "poisson": elasticity.material.poisson_ratio,

@@ -43,11 +43,17 @@ _FITTED = (2.0, 1.5, 1.2)  # radii of the mesh fitted to the surface, over the l
 class Resolution:
     """Size of the elements around a contact, :class:`avatar_core.geometry.refinement.Grading`.
 
-    core : longest edge at the centre, over the radius of the smallest contact
-    inner : its growth over the distance from the axis, up to the largest contact
-    outer : its growth beyond and below
-    reach : radius of the candidate surface over that of the contact on a half-space; a hollow
-        place needs more than a flat one
+    Attributes
+    ----------
+    core : float
+        Longest edge at the centre, over the radius of the smallest contact.
+    inner : float
+        Its growth over the distance from the axis, up to the largest contact.
+    outer : float
+        Its growth beyond and below.
+    reach : float
+        Radius of the candidate surface over that of the contact on a half-space; a hollow place
+        needs more than a flat one.
     """
 
     core: float = 0.3
@@ -60,10 +66,16 @@ class Resolution:
 class ResolvedPlace:
     """What tips feel at one place.
 
-    elasticity : the organ, refined there
-    condensed : CondensedContact, of the tips one by one along the normal
-    contacts : contacts[i][k] of tip i at depth k
-    axes : ndarray, shape (n_tips, n_depths, 3), along which their forces act, out of the organ
+    Attributes
+    ----------
+    elasticity : Elasticity
+        The organ, refined there.
+    condensed : CondensedContact
+        Condensed of the tips one by one along the normal.
+    contacts : tuple[tuple[Contact, ...], ...]
+        Contacts[i][k] of tip i at depth k.
+    axes : ndarray, shape (n_tips, n_depths, 3)
+        Along which their forces act, out of the organ.
     """
 
     elasticity: Elasticity
@@ -90,22 +102,31 @@ def contacts_at(
     progress: Callable[[float], None] | None = None,
     tumour: tuple[SurfaceMesh, float] | None = None,
 ) -> ResolvedPlace:
-    """Contacts of several tips, one by one, at several depths along the normal of one place.
+    """Return contacts of several tips, one by one, at several depths along the normal of one place.
 
     Parameters
     ----------
-    surface : SurfaceMesh, to which the mesh is fitted around the place; None to keep its facets
-    mesh : TetMesh, of the organ
-    regions : Regions, of the mesh
+    surface : SurfaceMesh or None
+        SurfaceMesh, to which the mesh is fitted around the place; None to keep its facets.
+    mesh : TetMesh
+        Mesh of the organ.
+    regions : Regions
+        Regions of the mesh.
     material : Material
-    place : ndarray, shape (3,), on the surface (or the facets), where depths are zero [m]
-    normal : ndarray, shape (3,), pointing out; the direction in which tips are pushed in, reversed,
-        and along which all but balls press
-    tips : sequence of Tip
-    depths : of a tip's lowest point below the place [m]
+    place : ndarray, shape (3,)
+        Place on the surface (or the facets), where depths are zero [m].
+    normal : ndarray, shape (3,)
+        Pointing out; the direction in which tips are pushed in, reversed, and along which all but
+        balls press.
+    tips : Sequence[Tip]
+        Sequence of Tip.
+    depths : Sequence[float]
+        Depths of a tip's lowest point below the place [m].
     resolution : Resolution
-    progress : as of :class:`avatar_core.fem.signorini.CondensedContact`
-    tumour : its surface and the contrast of Young's moduli
+    progress : Callable[[float], None] or None
+        See :class:`avatar_core.fem.signorini.CondensedContact`.
+    tumour : tuple[SurfaceMesh, float] or None
+        Its surface and the contrast of Young's moduli.
 
     Raises
     ------
@@ -133,7 +154,7 @@ def contacts_at(
 
 
 def _without_moment(elasticity: Elasticity, push: Push, contact: Contact) -> tuple[Contact, Push]:
-    """The contact of a ball whose force goes through its centre, and its push."""
+    """Return the contact of a ball whose force goes through its centre, and its push."""
     for _ in range(_TURNS):
         (touch,) = contact.touches
         if np.linalg.norm(touch.lean) < LEANING:
@@ -162,7 +183,7 @@ def refined_organ(
     resolution: Resolution = Resolution(),
     tumour: tuple[SurfaceMesh, float] | None = None,
 ) -> Elasticity:
-    """The organ's elastic problem on a mesh that resolves contacts at some places.
+    """Return the organ's elastic problem on a mesh that resolves contacts at some places.
 
     Parameters as in :func:`contacts_at`, with shape (n, 3) for places and normals, on which all
     tips and depths are expected.

@@ -24,15 +24,23 @@ def silent(stage: str, fraction: float, error: float) -> None:
 class BuildRule:
     """Tolerance and sizes of a build.
 
-    tolerance : mean relative L2 error over the build's own loads; the worst load may have
-        ``worst_over_mean`` times it
-    max_modes : modes that show the displacement at a place at most: global ones, and those of the
-        place's region
-    global_modes : that all regions share, at most; and at most four in ten of ``max_modes``
-    contact_modes : of the contact compliance at most, the global ones among them
-    region_area : of the load surface for each region, in squared patch radii; a region has 30
-        load positions at least, in the mean
-    contact_support : reach of the contact near field, in patch radii
+    Attributes
+    ----------
+    tolerance : float
+        Mean relative L2 error over the build's own loads; the worst load may have
+        ``worst_over_mean`` times it.
+    max_modes : int
+        Modes that show the displacement at a place at most: global ones, and those of the place's
+        region.
+    global_modes : int
+        Global modes that all regions share, at most; and at most four in ten of ``max_modes``.
+    contact_modes : int
+        Contact modes of the contact compliance at most, the global ones among them.
+    region_area : float
+        Region area of the load surface for each region, in squared patch radii; a region has 30
+        load positions at least, in the mean.
+    contact_support : float
+        Reach of the contact near field, in patch radii.
     """
 
     tolerance: float = 0.006
@@ -55,10 +63,10 @@ class BuildRule:
         return RegionalRule(self.tolerance, self.worst_over_mean * self.tolerance, most)
 
     def regions(self, surface: LoadSurface) -> IntArray:
-        """Region of each load position, shape (n_positions,) int32."""
+        """Return the region of each load position, shape (n_positions,) int32."""
         wanted = round(surface.area / (self.region_area * surface.patch_radius**2))
         return regions_of(surface.centers, min(wanted, surface.n_positions // _REGION_POSITIONS))
 
     def is_met(self, mean: float, worst: float) -> bool:
-        """Whether errors over the build's own loads are as small as asked for."""
+        """Return whether errors over the build's own loads are as small as asked for."""
         return mean <= self.tolerance and worst <= self.worst_over_mean * self.tolerance

@@ -46,9 +46,14 @@ CLAMPED = "clamped"
 class SupportOption:
     """One support of a build.
 
-    name : of an attachment by rule, or of a group of a file
-    stiffness : per area [N/m^3]; infinity for a clamp
-    coordinate : its range, if it stays free; ``stiffness`` is where a vademecum begins
+    Attributes
+    ----------
+    name : str
+        Name of an attachment by rule, or of a group of a file.
+    stiffness : float
+        Per area [N/m^3]; infinity for a clamp.
+    coordinate : Coordinate or None
+        Its range, if it stays free; ``stiffness`` is where a vademecum begins.
 
     Raises
     ------
@@ -100,7 +105,7 @@ class SupportOption:
 def held_by(
     mesh: TetMesh, options: Sequence[SupportOption], groups: Path | None = None
 ) -> tuple[Regions, tuple[Support, ...]]:
-    """:func:`held_at` the attachments by rule, and what a file of groups says."""
+    """Return :func:`held_at` the attachments by rule, and what a file of groups says."""
     given = {} if groups is None else faces_of_groups(mesh, read_groups(groups))
     return held_at(mesh, options, attachments_by_rule(mesh) | given)
 
@@ -114,8 +119,9 @@ def held_at(
 
     Parameters
     ----------
-    places : faces of each support, ndarrays of bool, shape (n_faces,); of ``clamped`` and
-        ``accessible`` too, if they are not left to the supports and the rule
+    places : Mapping[str, ndarray]
+        Faces of each support, ndarrays of bool, shape (n_faces,); of ``clamped`` and ``accessible``
+        too, if they are not left to the supports and the rule.
 
     Raises
     ------

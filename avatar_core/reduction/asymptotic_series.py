@@ -25,13 +25,15 @@ from avatar_core.fem.hyperelasticity import Hyperelasticity
 
 
 def path_series(problem: Hyperelasticity, loads: FloatArray, order: int) -> FloatArray:
-    """U_1, ..., U_order for several loads.
+    """Return U_1, ..., U_order for several loads.
 
     Parameters
     ----------
     problem : Hyperelasticity
-    loads : ndarray, shape (3 n_nodes, n), dead loads of unit size, each a path of its own
-    order : highest power kept
+    loads : ndarray, shape (3 n_nodes, n)
+        Dead loads of unit size, each a path of its own.
+    order : int
+        Highest power kept.
 
     Returns
     -------
@@ -61,7 +63,7 @@ class _State:
             self._G[:, :, 0] = np.eye(3)
 
     def forces(self, displacement: FloatArray, k: int) -> FloatArray:
-        """N_k, shape (3 n_nodes,), once U_k-1 is known."""
+        """Return N_k, shape (3 n_nodes,), once U_k-1 is known."""
         problem = self._problem
         lam, mu = problem.material.linear.lame
         kernel = _neo_hookean if isinstance(problem.material, NeoHookean) else _st_venant
@@ -75,7 +77,7 @@ class _State:
 
 @compiled(fastmath=True)
 def _gradient(gradients, nodes, displacement, F):  # type: ignore[no-untyped-def]
-    """grad u at one quadrature point."""
+    """Return grad u at one quadrature point."""
     F[:] = 0.0
     for a in range(10):
         for i in range(3):

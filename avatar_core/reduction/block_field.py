@@ -40,7 +40,10 @@ _LARGEST = np.float32(32767)  # of int16: rounding costs 1 / 65536 of a mode's p
 class Blocks:
     """The vertices of a mesh in compact blocks.
 
-    vertex : ndarray of int32, shape (n_blocks POINTS,), in each place; -1 where a block is not full
+    Attributes
+    ----------
+    vertex : ndarray of int32, shape (n_blocks POINTS,)
+        Vertex in each place; -1 where a block is not full.
     """
 
     vertex: IntArray
@@ -59,7 +62,7 @@ class Blocks:
         return out
 
     def that_hold(self, vertices: IntArray) -> int:
-        """Number of the first blocks that hold all of some vertices."""
+        """Return the number of the first blocks that hold all of some vertices."""
         return int(self.place[vertices].max(initial=-1)) // POINTS + 1
 
     def of(self, field: FloatArray) -> FloatArray:
@@ -70,7 +73,7 @@ class Blocks:
         return found.reshape(self.n_blocks, BLOCK, field.shape[1])
 
     def at_vertices(self, field: FloatArray) -> FloatArray:
-        """Columns (3 n_vertices, n) of values in the blocks (n_blocks, BLOCK, n)."""
+        """Return the columns (3 n_vertices, n) of values in the blocks (n_blocks, BLOCK, n)."""
         rows = field.reshape(len(self.vertex), 3, field.shape[2])[self.place]
         return np.asarray(rows.reshape(-1, field.shape[2]))
 
@@ -89,13 +92,22 @@ class BlockField:
 
     Part 0 shows global modes that move beside the loads; then comes a part for each region.
 
-    region : ndarray of int32, shape (n_positions,), region of each load position
-    load : ndarray, shape (n_positions, n_loads, most), W; zero beyond the region's amplitudes
-    count : ndarray of int32, shape (n_parts,), amplitudes of each part; part 0 has the global ones
-    space : ndarray of int16, shape (n, BLOCK), Z, each with a peak of 32767
-    core : ndarray, shape (n, most), C
-    level : ndarray of int32, shape (n,), of each mode in its part; see :class:`BlockModes`
-    start : ndarray of int64, shape (n_parts, n_blocks + 1), modes of each part in each block
+    Attributes
+    ----------
+    region : ndarray of int32, shape (n_positions,)
+        Region of each load position.
+    load : ndarray, shape (n_positions, n_loads, most)
+        W; zero beyond the region's amplitudes.
+    count : ndarray of int32, shape (n_parts,)
+        Amplitudes of each part; part 0 has the global ones.
+    space : ndarray of int16, shape (n, BLOCK)
+        Z, each with a peak of 32767.
+    core : ndarray, shape (n, most)
+        C.
+    level : ndarray of int32, shape (n,)
+        Level of each mode in its part; see :class:`BlockModes`.
+    start : ndarray of int64, shape (n_parts, n_blocks + 1)
+        Modes of each part in each block.
     """
 
     region: IntArray
@@ -128,7 +140,7 @@ class BlockField:
         return sum(a.nbytes for a in arrays)
 
     def of_part(self, part: int, amplitude: FloatArray) -> FloatArray:
-        """Displacement by amplitudes (count, n) of a part, shape (n_blocks, BLOCK, n)."""
+        """Return displacement by amplitudes (count, n) of a part, shape (n_blocks, BLOCK, n)."""
         n_blocks = self.start.shape[1] - 1
         out = np.empty((n_blocks, BLOCK, amplitude.shape[1]), np.float32)
         amplitude = amplitude.astype(np.float32)
@@ -144,7 +156,7 @@ class BlockField:
         return np.asarray(np.tensordot(load, forces, ((0, 1), (0, 1))))
 
     def under(self, positions: IntArray, forces: FloatArray) -> FloatArray:
-        """Displacement by forces (n, n_loads, m) at some positions, (n_blocks, BLOCK, m)."""
+        """Return displacement by forces (n, n_loads, m) at some positions, (n_blocks, BLOCK, m)."""
         out = np.zeros((self.start.shape[1] - 1, BLOCK, forces.shape[2]), np.float32)
         regions = self.region[positions]
         for r in np.unique(regions):
@@ -153,12 +165,12 @@ class BlockField:
         return out
 
     def combined(self, positions: IntArray, weights: FloatArray) -> FloatArray:
-        """Weighted sum over some load positions, shape (n_blocks, BLOCK, n_loads)."""
+        """Return the weighted sum over some load positions, shape (n_blocks, BLOCK, n_loads)."""
         one = np.eye(self.load.shape[1], dtype=np.float32)
         return self.under(positions, np.asarray(weights, np.float32)[:, None, None] * one)
 
     def with_most(self, most: int) -> BlockField:
-        """The same with the first amplitudes of each region alone."""
+        """Return the same with the first amplitudes of each region alone."""
         return replace(
             self,
             load=self.load[:, :, :most],
@@ -167,7 +179,7 @@ class BlockField:
         )
 
     def softened(self, factor: float) -> BlockField:
-        """The field times a number, global modes and their amplitudes by its root each."""
+        """Return the field times a number, global modes and their amplitudes by its root each."""
         root, n = np.float32(np.sqrt(factor)), self.n_shared
         load, core = np.float32(factor) * self.load, self.core.copy()
         load[:, :, :n] = root * self.load[:, :, :n]
@@ -185,18 +197,24 @@ def separate_field(
     tolerance: float = TOLERANCE,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> BlockField:
-    """The field of global modes and those of regions, in blocks.
+    """Return the field of global modes and those of regions, in blocks.
 
     Parameters
     ----------
     blocks : Blocks
-    volumes : ndarray, shape (n_vertices,), by which errors are weighted
-    region : ndarray of int32, shape (n_positions,), of each load position
-    regions : RegionModes of each region
-    shared : global modes (3 n_vertices, k) and their amounts in each load (n_positions, n_loads,
-        k); None if there are none
-    motion : ndarray, shape (n, k), amplitudes that the global modes may have beside the loads
-    tolerance : of a region's loads, as of :func:`separate_blocks`
+    volumes : ndarray, shape (n_vertices,)
+        By which errors are weighted.
+    region : ndarray of int32, shape (n_positions,)
+        Region of each load position.
+    regions : Sequence[RegionModes]
+        RegionModes of each region.
+    shared : tuple[ndarray, ndarray] or None
+        Global modes (3 n_vertices, k) and their amounts in each load (n_positions, n_loads, k);
+        None if there are none.
+    motion : ndarray, shape (n, k)
+        Amplitudes that the global modes may have beside the loads.
+    tolerance : float
+        Tolerance of a region's loads, as of :func:`separate_blocks`.
     """
     n_loads = regions[0].load.shape[1]
     if shared is None:
@@ -233,7 +251,7 @@ def _separated(
 def _joined(
     parts: Sequence[BlockModes], most: int
 ) -> tuple[IntArray, FloatArray, IntArray, IntArray]:
-    """space in 16 bits, core, level and start of all parts.
+    """Return space in 16 bits, core, level and start of all parts.
 
     The time of a step is that of reading its modes; these take half as long as in single precision.
     """

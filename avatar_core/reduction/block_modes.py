@@ -23,11 +23,17 @@ from avatar_core.common.arrays import FloatArray, IntArray
 class BlockModes(NamedTuple):
     """The modes of a field in every block.
 
-    space : ndarray of float32, shape (n, values of a block), Z, each with a peak of 1
-    core : ndarray of float32, shape (n, m), C, of the amplitudes of m modes of the whole field
-    level : ndarray of int32, shape (n,), from 1 on: modes for each block, in the mean over the
-        blocks, with which this one is the first to be among them; ascending in each block
-    start : ndarray of int64, shape (n_blocks + 1,), modes of each block, the strongest first
+    Attributes
+    ----------
+    space : ndarray of float32, shape (n, values of a block)
+        Z, each with a peak of 1.
+    core : ndarray of float32, shape (n, m)
+        C, of the amplitudes of m modes of the whole field.
+    level : ndarray of int32, shape (n,)
+        Level from 1 on: modes for each block, in the mean over the blocks, with which this one is
+        the first to be among them; ascending in each block.
+    start : ndarray of int64, shape (n_blocks + 1,)
+        Modes of each block, the strongest first.
     """
 
     space: FloatArray
@@ -45,7 +51,7 @@ class BlockModes(NamedTuple):
 
 
 def compact_order(points: FloatArray, size: int) -> IntArray:
-    """An order of points in which each ``size`` successive ones lie together.
+    """Return an order of points in which each ``size`` successive ones lie together.
 
     By recursive coordinate bisection (Berger & Bokhari, IEEE Trans. Computers 36, 1987): halved
     across the longest side, at a multiple of ``size``.
@@ -73,7 +79,7 @@ def load_sizes(fields: FloatArray, mass: FloatArray, loads: FloatArray) -> Float
 def separate_blocks(
     fields: FloatArray, mass: FloatArray, loads: FloatArray, sizes: FloatArray, tolerance: float
 ) -> BlockModes:
-    """The modes of every block.
+    """Return the modes of every block.
 
     Parameters
     ----------

@@ -13,9 +13,14 @@ from avatar_core.common.arrays import FloatArray
 class CompactResponse:
     """Displacement under unit loads u(x, s) ~ X(x) Y(s)^T, with Y Y^T the contact compliance.
 
-    space : ndarray, shape (3 n_vertices, rank), X, K-orthonormal for an anatomy
-    load : ndarray, shape (3 n_positions, rank), Y
-    residual_compliance : ndarray, shape (n_positions, 3, 3) [m/N], C - Y Y^T of each patch
+    Attributes
+    ----------
+    space : ndarray, shape (3 n_vertices, rank)
+        X, K-orthonormal for an anatomy.
+    load : ndarray, shape (3 n_positions, rank)
+        Y.
+    residual_compliance : ndarray, shape (n_positions, 3, 3)
+        Residual compliance [m/N], C - Y Y^T of each patch.
     """
 
     space: FloatArray
@@ -24,6 +29,6 @@ class CompactResponse:
 
 
 def positive_part(blocks: FloatArray) -> FloatArray:
-    """Symmetric 3 x 3 blocks without their negative eigenvalues, shape (n, 3, 3)."""
+    """Return the symmetric 3 x 3 blocks without their negative eigenvalues, shape (n, 3, 3)."""
     value, vector = np.linalg.eigh((blocks + blocks.transpose(0, 2, 1)) / 2.0)
     return np.asarray((vector * np.maximum(value, 0.0)[:, None]) @ vector.transpose(0, 2, 1))

@@ -47,11 +47,16 @@ _LIMITS = {
 class Coordinate:
     """A parameter of the organ that may be chosen when the vademecum is used.
 
-    name : "poisson" (Poisson's ratio), "contrast" (Young's modulus inside the tumour over that
+    Attributes
+    ----------
+    name : str
+        "poisson" (Poisson's ratio), "contrast" (Young's modulus inside the tumour over that
         outside), "support.NAME" (stiffness per area of a support [N/m^3]) or "resection" (opened
-        part of a cut)
-    low, high : its range
-    n_nodes : at which the organ is solved, both ends included; 0: as many as the range needs
+        part of a cut).
+    low, high : float
+        Its range.
+    n_nodes : int
+        n nodes at which the organ is solved, both ends included; 0: as many as the range needs.
 
     Raises
     ------
@@ -94,7 +99,7 @@ class Coordinate:
 
     @classmethod
     def parse(cls, text: str) -> Coordinate:
-        """``NAME=LOW:HIGH`` or ``NAME=LOW:HIGH:NODES``, as on the command line."""
+        """Return ``NAME=LOW:HIGH`` or ``NAME=LOW:HIGH:NODES``, as on the command line."""
         name, _, span = text.partition("=")
         try:
             low, high, *nodes = span.split(":")
@@ -114,7 +119,7 @@ class Coordinate:
         return np.array([self.value_at(t) for t in np.linspace(0.0, 1.0, self.n_nodes)])
 
     def value_at(self, fraction: float) -> float:
-        """The value at a fraction of the range, 0 to 1, in the coordinate's own scale."""
+        """Return the value at a fraction of the range, 0 to 1, in the coordinate's own scale."""
         low, high = self._scaled(self.low), self._scaled(self.high)
         value = self._unscaled(low + fraction * (high - low))
         return float(np.clip(value, self.low, self.high))  # not even rounding leaves the range
@@ -125,7 +130,7 @@ class Coordinate:
         return (self._scaled(value) - low) / (high - low)
 
     def weights(self, value: float) -> np.ndarray:
-        """Weights of the nodes at a value: at least 0, summing to 1, at most two not 0.
+        """Return the weights of the nodes at a value: at least 0, summing to 1, at most two not 0.
 
         Raises
         ------
@@ -151,14 +156,14 @@ class Coordinate:
 
 
 def node_values(coordinates: Sequence[Coordinate]) -> list[dict[str, float]]:
-    """The values at every node of the grid that several coordinates span."""
+    """Return the values at every node of the grid that several coordinates span."""
     grids = product(*(coordinate.nodes for coordinate in coordinates))
     names = [coordinate.name for coordinate in coordinates]
     return [dict(zip(names, map(float, values), strict=True)) for values in grids]
 
 
 def node_weights(coordinates: Sequence[Coordinate], values: Mapping[str, float]) -> np.ndarray:
-    """Weights of :func:`node_values` at some values, shape (n_nodes,)."""
+    """Return the weights of :func:`node_values` at some values, shape (n_nodes,)."""
     weights = np.ones(1)
     for coordinate in coordinates:
         weights = np.outer(weights, coordinate.weights(values[coordinate.name])).ravel()
@@ -178,7 +183,7 @@ def require_known(coordinates: Sequence[Coordinate], values: Mapping[str, float]
 
 
 def option_of(name: str) -> str:
-    """Option of the command line that makes a coordinate."""
+    """Return the option of the command line that makes a coordinate."""
     if name == RESECTION:
         return "--resection FILE"
     is_support = name.startswith(SUPPORT)
@@ -200,7 +205,7 @@ def stiffness_of(values: Mapping[str, float]) -> dict[str, float]:
 
 
 def problem_at(elasticity: Elasticity, values: Mapping[str, float]) -> Elasticity:
-    """The elastic problem at values of the coordinates; others keep their values."""
+    """Return the elastic problem at values of the coordinates; others keep their values."""
     poisson = values.get("poisson", elasticity.material.poisson_ratio)
     material = replace(elasticity.material, poisson_ratio=poisson)
     return elasticity.at(

@@ -44,11 +44,18 @@ WORST_OVER_MEAN = 2.0  # estimated, of the mean asked for; the true worst may be
 class ReductionRule:
     """How large the space may become.
 
-    n_start : load functions of the neighbours
-    n_block : load positions solved in one enrichment, three directions each
-    n_probes : load positions solved exactly to calibrate the estimate
-    max_solution_fraction : fine solutions at most, probes included, over those of the full problem
-    supports : candidates for the reach of the residual compliance, in patch radii
+    Attributes
+    ----------
+    n_start : int
+        Load functions of the neighbours.
+    n_block : int
+        Load positions solved in one enrichment, three directions each.
+    n_probes : int
+        Load positions solved exactly to calibrate the estimate.
+    max_solution_fraction : float
+        Fine solutions at most, probes included, over those of the full problem.
+    supports : tuple[float, ...]
+        Candidates for the reach of the residual compliance, in patch radii.
     """
 
     n_start: int = 80
@@ -62,8 +69,14 @@ class ReductionRule:
 class GalerkinErrorEstimate:
     """Estimated relative L2 errors of displacement over all loads, and what was spent.
 
-    mean, worst : over the load positions, three directions together
-    rank : of the space; solutions : fine ones so far, probes included
+    Attributes
+    ----------
+    mean, worst : float
+        Over the load positions, three directions together.
+    rank : int
+        Rank of the space.
+    solutions : int
+        Fine ones so far, probes included.
     """
 
     mean: float
@@ -80,14 +93,21 @@ class GalerkinBasis:
 
     Parameters
     ----------
-    elasticity : Elasticity of the patient's own mesh
-    loads : sparse, shape (3 n_nodes, n_loads), F
-    single : solve in single precision
+    elasticity : Elasticity
+        Elasticity of the patient's own mesh.
+    loads : sp.csr_matrix
+        Sparse, shape (3 n_nodes, n_loads), F.
+    single : bool
+        Solve in single precision.
 
     Attributes
     ----------
-    space : ndarray, shape (3 n_vertices, rank), X; applied, load : (n_loads, rank), A and Y
-    load_norm : ndarray, shape (n_positions,), root of the trace of f . D^-1 f
+    space : ndarray, shape (3 n_vertices, rank)
+        X.
+    applied, load
+        (n_loads, rank), A and Y.
+    load_norm : ndarray, shape (n_positions,)
+        Root of the trace of f . D^-1 f.
     """
 
     def __init__(self, elasticity: Elasticity, loads: sp.csr_matrix, single: bool = False) -> None:
@@ -133,7 +153,7 @@ class GalerkinBasis:
         self.applied = np.hstack([self.applied, applied])
 
     def residual_blocks(self) -> NDArray[np.float64]:
-        """r(s) . D^-1 r(s) of each position, by directions, shape (n_positions, 3, 3) [m/N].
+        """Return r(s) . D^-1 r(s) of each position, by directions, shape (n_positions, 3, 3) [m/N].
 
         With G = F^T D^-1 F and r = F (1 - A Y^T) they are the diagonal blocks of
         G - G A Y^T - Y A^T G + Y A^T G A Y^T.
@@ -156,9 +176,13 @@ class GalerkinBasis:
 class Probes:
     """Loads that are solved exactly and kept out of the space.
 
+    Attributes
+    ----------
     positions : ndarray of int, shape (n,)
-    columns : ndarray, shape (3 n_vertices, 3 n), exact displacement [m/N]
-    compliance : ndarray, shape (3 n_positions, 3 n), exact displacement of all patches [m/N]
+    columns : ndarray, shape (3 n_vertices, 3 n)
+        Exact displacement [m/N].
+    compliance : ndarray, shape (3 n_positions, 3 n)
+        Exact displacement of all patches [m/N].
     """
 
     positions: NDArray[np.int64]
@@ -180,10 +204,16 @@ class Probes:
 class ReducedResponse:
     """The response in the space that was found.
 
-    response : CompactResponse at the patient's vertices and load positions
-    support : reach of the residual compliance [m]
-    history : one GalerkinErrorEstimate for the first space and after each enrichment
-    converged : the last estimate is below the tolerance
+    Attributes
+    ----------
+    response : CompactResponse
+        CompactResponse at the patient's vertices and load positions.
+    support : float
+        Reach of the residual compliance [m].
+    history : tuple[GalerkinErrorEstimate, ...]
+        One GalerkinErrorEstimate for the first space and after each enrichment.
+    converged : bool
+        The last estimate is below the tolerance.
     """
 
     response: CompactResponse
@@ -201,17 +231,21 @@ def reduce(
     rule: ReductionRule | None = None,
     progress: Callable[[float, GalerkinErrorEstimate], None] = lambda fraction, estimate: None,
 ) -> ReducedResponse:
-    """Galerkin response from the neighbours' load functions, enriched until the tolerance.
+    """Return Galerkin response from the neighbours' load functions, enriched until the tolerance.
 
     Stops at the tolerance (mean, and twice that for the worst load), or with ``converged``
     False after ``max_solution_fraction`` of the fine solutions.
 
     Parameters
     ----------
-    elasticity, loads, surface : of the patient's own mesh
-    load_functions : ndarray, shape (n_loads, n), carried over, most important first
-    tolerance : mean relative L2 error of displacement
-    progress : called with the fraction of the allowed solutions that is spent, and the estimate
+    elasticity, loads, surface : Elasticity
+        Elasticity, loads and surface of the patient's own mesh.
+    load_functions : ndarray, shape (n_loads, n)
+        Carried over, most important first.
+    tolerance : float
+        Mean relative L2 error of displacement.
+    progress : Callable[[float, GalerkinErrorEstimate], None]
+        Called with the fraction of the allowed solutions that is spent, and the estimate.
     """
     rule = rule or ReductionRule()
     limit = max(int(rule.max_solution_fraction * loads.shape[1]), 3 * (rule.n_probes + 1))
@@ -240,7 +274,7 @@ def reduce(
 def solve_probes(
     elasticity: Elasticity, loads: sp.csr_matrix, n: int, single: bool = False, seed: int = 0
 ) -> Probes:
-    """Exact solutions for random load positions."""
+    """Return the exact solutions for random load positions."""
     chosen = np.random.default_rng(seed).permutation(loads.shape[1] // 3)[:n]
     solution = elasticity.solve(loads[:, triples(chosen)], single)
     return Probes(chosen, elasticity.at_vertices(solution), loads.T @ solution)
@@ -249,7 +283,7 @@ def solve_probes(
 def estimate_errors(
     basis: GalerkinBasis, probes: Probes, blocks: NDArray[np.float64]
 ) -> GalerkinErrorEstimate:
-    """Errors of all loads from their residuals, calibrated on the probes.
+    """Return the errors of all loads from their residuals, calibrated on the probes.
 
     e(s) ~ c times :func:`relative_residual`, c the ratio of the means over the probes. The worst is
     as much larger than the largest e(s) as that of the probes which is underestimated most.
@@ -263,7 +297,7 @@ def estimate_errors(
 
 
 def is_met(estimate: GalerkinErrorEstimate, tolerance: float) -> bool:
-    """Whether mean and worst error are as small as asked for."""
+    """Return whether mean and worst error are as small as asked for."""
     return estimate.mean <= tolerance and estimate.worst <= WORST_OVER_MEAN * tolerance
 
 
@@ -298,7 +332,7 @@ def residual_compliance(
     blocks: NDArray[np.float64],
     rule: ReductionRule,
 ) -> tuple[FloatArray, float]:
-    """Residual compliance of each patch, C - Y Y^T, and the distance over which it extends.
+    """Return residual compliance of each patch, C - Y Y^T, and the distance over which it extends.
 
     M(s) = alpha eta-blocks(s), alpha such that the traces at the probes agree; the reach is the
     candidate for which :func:`residual_compliance_blocks` fits the probes' columns best.
@@ -337,8 +371,10 @@ def residual_compliance_blocks(
 
     Parameters
     ----------
-    compliance : ndarray, shape (n_positions, 3, 3) [m/N], M
-    support, reach : [m]
+    compliance : ndarray, shape (n_positions, 3, 3)
+        Compliance [m/N], M.
+    support, reach : float
+        Support and reach [m].
     """
     pairs = near_pairs(surface.centers, surface.centers, reach)
     root = _root(compliance)
@@ -349,7 +385,7 @@ def residual_compliance_blocks(
 
 
 def _blocks_of_triples(matrix: sp.csr_matrix) -> NDArray[np.float64]:
-    """The 3 x 3 blocks on the diagonal of a sparse matrix, shape (n, 3, 3)."""
+    """Return the 3 x 3 blocks on the diagonal of a sparse matrix, shape (n, 3, 3)."""
     entries, blocks = matrix.tocoo(), np.zeros((matrix.shape[0] // 3, 3, 3))
     own = entries.row // 3 == entries.col // 3
     row, column = entries.row[own], entries.col[own]
@@ -365,7 +401,7 @@ def _unit_functions(loads: NDArray[np.int64], n_loads: int) -> FloatArray:
 
 
 def _root(blocks: FloatArray) -> FloatArray:
-    """Symmetric square roots of positive semi-definite 3 x 3 blocks."""
+    """Return the symmetric square roots of positive semi-definite 3 x 3 blocks."""
     value, vector = np.linalg.eigh(blocks)
     return np.asarray(
         (vector * np.sqrt(np.maximum(value, 0.0))[:, None]) @ vector.transpose(0, 2, 1)
@@ -379,9 +415,12 @@ def compact_response(
 
     Parameters
     ----------
-    elasticity : Elasticity on the registered template
-    loads : sparse, shape (3 n_nodes, n_loads), patches at the registered positions
-    rank : modes, each two solutions
+    elasticity : Elasticity
+        Elasticity on the registered template.
+    loads : sp.csr_matrix
+        Sparse, shape (3 n_nodes, n_loads), patches at the registered positions.
+    rank : int
+        Modes, each two solutions.
     """
     rank = min(rank, loads.shape[1])
     functions = np.random.default_rng(0).standard_normal((loads.shape[1], rank))

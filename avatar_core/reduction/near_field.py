@@ -18,9 +18,13 @@ from avatar_core.common.jit import compiled, inlined
 class LocalBlocks:
     """Sparse 3 x 3 blocks by load position (compressed rows).
 
+    Attributes
+    ----------
     start : ndarray of int64, shape (n_positions + 1,)
-    target : ndarray of int32, shape (n_blocks,), load positions, ascending within a row
-    block : ndarray, shape (n_blocks, 3, 3), displacement component by load direction [m/N]
+    target : ndarray of int32, shape (n_blocks,)
+        Load positions, ascending within a row.
+    block : ndarray, shape (n_blocks, 3, 3)
+        Displacement component by load direction [m/N].
     """
 
     start: np.ndarray
@@ -47,7 +51,7 @@ class LocalBlocks:
         return np.asarray(self.target >= self.position)
 
     def combined(self, positions: np.ndarray, weights: np.ndarray, n_targets: int) -> np.ndarray:
-        """Weighted sum of some rows, dense, shape (3 n_targets, 3)."""
+        """Return the weighted sum of some rows, dense, shape (3 n_targets, 3)."""
         out = np.zeros((n_targets, 3, 3))
         for j, weight in zip(positions, weights, strict=True):
             row = slice(self.start[j], self.start[j + 1])
@@ -59,9 +63,14 @@ class LocalBlocks:
 class Mirror:
     """From the upper half of symmetric blocks to all of them.
 
-    start, target : of all blocks
-    source : ndarray, shape (n_blocks,), the block of the upper half that each is, or the transpose
-        of; turned : ndarray of bool, shape (n_blocks,), whether it is the transpose
+    Attributes
+    ----------
+    start, target : ndarray
+        Start and target of all blocks.
+    source : ndarray, shape (n_blocks,)
+        The block of the upper half that each is, or the transpose of.
+    turned : ndarray of bool, shape (n_blocks,)
+        Whether it is the transpose.
     """
 
     start: np.ndarray
@@ -87,7 +96,7 @@ class Mirror:
         )
 
     def whole(self, block: np.ndarray) -> np.ndarray:
-        """All blocks, of those of the upper half (..., n_upper, 3, 3)."""
+        """Return all blocks, of those of the upper half (..., n_upper, 3, 3)."""
         out = block[..., self.source, :, :]
         out[..., self.turned, :, :] = out[..., self.turned, :, :].swapaxes(-1, -2)
         return np.ascontiguousarray(out)
@@ -103,7 +112,7 @@ class Pairs:
 
 
 def near_pairs(positions: np.ndarray, targets: np.ndarray, radius: float) -> Pairs:
-    """All pairs closer than ``radius``; rows by position, targets ascending."""
+    """Return all pairs closer than ``radius``; rows by position, targets ascending."""
     # Here, because the contact node needs none of it.
     from scipy.spatial import cKDTree
 
@@ -116,7 +125,7 @@ def near_pairs(positions: np.ndarray, targets: np.ndarray, radius: float) -> Pai
 
 
 def taper(distance: np.ndarray) -> np.ndarray:
-    """One at distance 0, zero from 1, and positive definite in space.
+    """Return one at distance 0, zero from 1, and positive definite in space.
 
     The entry-wise product of two positive semi-definite matrices is positive semi-definite
     (Schur), so tapering a residual compliance with it keeps every contact problem well posed;
@@ -134,12 +143,14 @@ _HASH = 2654435761  # Knuth's multiplicative hashing, The Art of Computer Progra
 
 
 def hash_rows(near: LocalBlocks) -> tuple[np.ndarray, np.ndarray]:
-    """Open-addressing tables by which a compiled loop finds one block of a row at once.
+    """Return the open-addressing tables by which a compiled loop finds one block of a row at once.
 
     Returns
     -------
-    start : ndarray of int64, shape (n_rows + 1,), slots of each row, a power of two
-    slot : ndarray of int32, shape (n_slots, 2), target (-1: empty) and index of its block
+    start : ndarray of int64, shape (n_rows + 1,)
+        Slots of each row, a power of two.
+    slot : ndarray of int32, shape (n_slots, 2)
+        Target (-1: empty) and index of its block.
     """
     length = np.diff(near.start)
     size = 2 ** np.ceil(np.log2(np.maximum(2 * length, 2))).astype(np.int64)

@@ -44,9 +44,14 @@ class EnrichmentStatus(Enum):
 class EnrichmentReport:
     """One greedy enrichment: its status, the sweeps it took and what was left after it.
 
-    modes : pairs added
-    change : relative change of the energy that R S captures, in the last sweep
-    energy_error : sqrt(residual energy / total energy) after the enrichment
+    Attributes
+    ----------
+    modes : int
+        Pairs added.
+    change : float
+        Relative change of the energy that R S captures, in the last sweep.
+    energy_error : float
+        sqrt(residual energy / total energy) after the enrichment.
     """
 
     status: EnrichmentStatus
@@ -60,11 +65,18 @@ class EnrichmentReport:
 class PGDRule:
     """When to stop.
 
-    max_modes : pairs at most
-    tolerance : stop when the relative energy error is below
-    block : pairs sought at once
-    max_sweeps : alternating directions per enrichment at most
-    sweep_tolerance : an enrichment has converged when the energy it captures changes less
+    Attributes
+    ----------
+    max_modes : int
+        Pairs at most.
+    tolerance : float
+        Stop when the relative energy error is below.
+    block : int
+        Pairs sought at once.
+    max_sweeps : int
+        Alternating directions per enrichment at most.
+    sweep_tolerance : float
+        An enrichment has converged when the energy it captures changes less.
     """
 
     max_modes: int
@@ -78,7 +90,10 @@ class PGDRule:
 class PGDSolution:
     """K-orthonormal space functions, their load functions, and the history that led there.
 
-    space : ndarray, shape (3 n_nodes, rank), or as the problem writes it
+    Attributes
+    ----------
+    space : ndarray, shape (3 n_nodes, rank)
+        Or as the problem writes it.
     load : ndarray, shape (n_loads, rank)
     """
 
@@ -144,10 +159,16 @@ class _Expansion:
 class PGDProblem(Protocol):
     """K u(s) = f(s) for all loads s, as alternating directions need it.
 
-    shape : numbers of entries of a space function, and of loads
-    weights : ndarray, shape (n_loads,), positive, of each load in the norm over s
-    energy : ndarray, shape (n_loads,), f(s) . K^-1 f(s) [J], the patch compliance
-    rounding : by which orthonormal functions may be off
+    Attributes
+    ----------
+    shape : tuple[int, int]
+        Numbers of entries of a space function, and of loads.
+    weights : ndarray, shape (n_loads,)
+        Positive, of each load in the norm over s.
+    energy : ndarray, shape (n_loads,)
+        f(s) . K^-1 f(s) [J], the patch compliance.
+    rounding : float
+        By which orthonormal functions may be off.
     """
 
     @property
@@ -163,21 +184,25 @@ class PGDProblem(Protocol):
     def rounding(self) -> float: ...
 
     def solve(self, amounts: np.ndarray) -> np.ndarray:
-        """Space functions K^-1 sum_s f(s) a(s) of amounts a, shape (n_loads, n)."""
+        """Return the space functions K^-1 sum_s f(s) a(s) of amounts a, shape (n_loads, n)."""
 
     def observe(self, space: np.ndarray) -> np.ndarray:
-        """X . f(s) of space functions, shape (n_loads, n)."""
+        """Return X . f(s) of space functions, shape (n_loads, n)."""
 
     def apply(self, space: np.ndarray) -> np.ndarray:
-        """Dual functions, whose product with others is that in energy."""
+        """Return the dual functions, whose product with others is that in energy."""
 
 
 @dataclass(frozen=True)
 class LoadProblem:
     """A problem whose loads are solved on the way; see :class:`PGDProblem`.
 
-    elasticity : Elasticity, solves with and applies K
-    loads : sparse, shape (3 n_nodes, n_loads)
+    Attributes
+    ----------
+    elasticity : Elasticity
+        Solves with and applies K.
+    loads : sp.csr_matrix
+        Sparse, shape (3 n_nodes, n_loads).
     """
 
     elasticity: Elasticity
@@ -211,8 +236,11 @@ class SolvedLoads:
     X = K^-1 F c. Its products with the loads are C c, with C = F^T K^-1 F; in energy,
     X . K X' = c . C c'.
 
-    compliance : ndarray, shape (n_loads, n_loads), C, symmetric; in single precision, modes are
-        orthonormal to 1e-2 only, and those of little energy are not found
+    Attributes
+    ----------
+    compliance : ndarray, shape (n_loads, n_loads)
+        C, symmetric; in single precision, modes are orthonormal to 1e-2 only, and those of little
+        energy are not found.
     """
 
     compliance: np.ndarray
@@ -239,13 +267,15 @@ class SolvedLoads:
 def solve_pgd(
     problem: PGDProblem, rule: PGDRule, progress: Callable[[int], None] = lambda rank: None
 ) -> PGDSolution:
-    """Greedy enrichment with alternating directions until the rule stops it.
+    """Return the greedy enrichment with alternating directions until the rule stops it.
 
     Parameters
     ----------
-    problem : LoadProblem or SolvedLoads
+    problem : PGDProblem
+        LoadProblem or SolvedLoads.
     rule : PGDRule
-    progress : called with the rank after every enrichment
+    progress : Callable[[int], None]
+        Called with the rank after every enrichment.
 
     Raises
     ------
@@ -267,7 +297,7 @@ def solve_pgd(
 
 
 def _enrich(expansion: _Expansion, rule: PGDRule) -> EnrichmentReport:
-    """One enrichment: start at random loads with energy left, alternate, keep the result."""
+    """Return one enrichment: start at random loads with energy left, alternate, keep the result."""
     problem = expansion.problem
     rounding = _ROUNDING * float(problem.weights @ problem.energy)
     load = _start(expansion, min(rule.block, rule.max_modes - expansion.rank))
@@ -288,7 +318,7 @@ def _enrich(expansion: _Expansion, rule: PGDRule) -> EnrichmentReport:
 def _above_rounding(
     space: np.ndarray, load: np.ndarray, weights: np.ndarray, rounding: float
 ) -> np.ndarray:
-    """The combinations of a block's pairs that capture more energy than rounding does.
+    """Return the combinations of a block's pairs that capture more energy than rounding does.
 
     A block may ask for more than is left; what it then holds beside that is noise.
     """
@@ -299,7 +329,7 @@ def _above_rounding(
 
 
 def _start(expansion: _Expansion, block: int) -> np.ndarray:
-    """Random load functions, larger where more energy is left."""
+    """Return the random load functions, larger where more energy is left."""
     rng = np.random.default_rng(expansion.rank)
     left = np.sqrt(np.maximum(expansion.energy, 0.0))
     return left[:, None] * rng.standard_normal((len(left), block))

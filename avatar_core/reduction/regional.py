@@ -31,8 +31,12 @@ _ITERATIONS = 30  # of k-means
 class RegionModes(NamedTuple):
     """The modes of one region of the load surface.
 
-    space : ndarray, shape (3 n_vertices, n), Z, each with a peak of 1
-    load : ndarray, shape (n positions of the region, n_loads, n), W
+    Attributes
+    ----------
+    space : ndarray, shape (3 n_vertices, n)
+        Z, each with a peak of 1.
+    load : ndarray, shape (n positions of the region, n_loads, n)
+        W.
     """
 
     space: FloatArray
@@ -43,8 +47,14 @@ class RegionModes(NamedTuple):
 class RegionalRule:
     """How many modes a region gets.
 
-    tolerance : mean relative L2 error over the region's loads; worst : of its worst load
-    most : modes of a region at most
+    Attributes
+    ----------
+    tolerance : float
+        Mean relative L2 error over the region's loads.
+    worst : float
+        Worst of its worst load.
+    most : int
+        Modes of a region at most.
     """
 
     tolerance: float
@@ -69,20 +79,25 @@ def separate_regions(
     rule: RegionalRule,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> tuple[list[RegionModes], FloatArray]:
-    """The modes of every region.
+    """Return the modes of every region.
 
     Parameters
     ----------
     region : ndarray of int32, shape (n_positions,)
-    columns : of some positions, shape (3 n_vertices, n, n_loads)
-    size : ndarray, shape (n_positions, n_loads), L2 norm by which an error is relative
-    mass : ndarray, shape (3 n_vertices,), lumped
+    columns : Callable[[ndarray of int], ndarray]
+        Columns of some positions, shape (3 n_vertices, n, n_loads).
+    size : ndarray, shape (n_positions, n_loads)
+        L2 norm by which an error is relative.
+    mass : ndarray, shape (3 n_vertices,)
+        Lumped.
 
     Returns
     -------
-    modes : of each region
-    errors : ndarray, shape (most + 1, n_positions, n_loads), relative L2 error that so many modes
-        of its region leave each load; those beyond the modes kept leave what is left
+    modes : list[RegionModes]
+        Modes of each region.
+    errors : ndarray, shape (most + 1, n_positions, n_loads)
+        Relative L2 error that so many modes of its region leave each load; those beyond the modes
+        kept leave what is left.
     """
     parts = []
     errors = np.empty((rule.most + 1, *size.shape))
@@ -122,7 +137,7 @@ def _principal(
 
 
 def _with_peaks_of_one(modes: FloatArray, amounts: FloatArray, size: FloatArray) -> RegionModes:
-    """Modes (n_dofs, k), by the amounts (n, k) of them in scaled columns of some sizes."""
+    """Return modes (n_dofs, k), by the amounts (n, k) of them in scaled columns of some sizes."""
     peak = np.maximum(np.abs(modes).max(axis=0, initial=0.0), 1e-30)
     load = amounts.reshape(*size.shape, -1) * size[..., None] * peak
     return RegionModes(modes / peak, load.astype(np.float32))

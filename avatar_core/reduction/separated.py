@@ -11,8 +11,12 @@ import numpy as np
 class SeparatedField:
     """A field over space and load, as a sum of products.
 
-    space : ndarray, shape (n_dofs, rank), X_k at the degrees of freedom in space
-    load : ndarray, shape (n_loads, rank), Y_k at the loads (position and direction)
+    Attributes
+    ----------
+    space : ndarray, shape (n_dofs, rank)
+        X_k at the degrees of freedom in space.
+    load : ndarray, shape (n_loads, rank)
+        Y_k at the loads (position and direction).
     """
 
     space: np.ndarray
@@ -29,17 +33,17 @@ class SeparatedField:
         return self.space.nbytes + self.load.nbytes
 
     def evaluate(self, loads: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """The field under the chosen loads, shape (n_dofs, n_chosen)."""
+        """Return the field under the chosen loads, shape (n_dofs, n_chosen)."""
         return self.space @ self.load[loads].T
 
     def truncate(self, rank: int) -> SeparatedField:
-        """The first ``rank`` modes."""
+        """Return the first ``rank`` modes."""
         return SeparatedField(self.space[:, :rank], self.load[:, :rank])
 
     def sorted_by_norm(
         self, space_mass: np.ndarray, load_mass: np.ndarray | None = None
     ) -> SeparatedField:
-        """The same field with its modes mixed and sorted by :meth:`mixing_by_norm`."""
+        """Return the same field with its modes mixed and sorted by :meth:`mixing_by_norm`."""
         mixing = self.mixing_by_norm(space_mass, load_mass)
         return SeparatedField(self.space @ mixing, self.load @ mixing)
 
@@ -54,9 +58,10 @@ class SeparatedField:
 
         Parameters
         ----------
-        space_mass : ndarray, shape (n_dofs,), lumped, M
-        load_mass : ndarray, shape (n_loads,), W; by default 1 / |u|^2 of each load in M, which
-            makes the norm one of relative errors
+        space_mass : ndarray, shape (n_dofs,)
+            Lumped, M.
+        load_mass : ndarray, shape (n_loads,)
+            W; by default 1 / |u|^2 of each load in M, which makes the norm one of relative errors.
         """
         a = _gram_root(self.space, space_mass)
         if load_mass is None:
@@ -67,5 +72,5 @@ class SeparatedField:
 
 
 def _gram_root(factor: np.ndarray, mass: np.ndarray) -> np.ndarray:
-    """A with A^T A = factor^T M factor, also where the factor is rank deficient."""
+    """Return a with A^T A = factor^T M factor, also where the factor is rank deficient."""
     return np.asarray(np.linalg.qr(np.sqrt(mass)[:, None] * factor, mode="r"))

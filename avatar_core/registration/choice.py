@@ -41,7 +41,7 @@ def posed(
 
 
 def _off(vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule) -> float:
-    """Median distance of a cloud from the organ that was moved rigidly to it [m]."""
+    """Return the median distance of a cloud from the organ that was moved rigidly to it [m]."""
     motion, mesh = rigid_motion(vademecum, cloud, rule), vademecum.mesh
     points = motion.back(cloud.thinned())
     feet, _, _ = closest_points(mesh.vertices, mesh.boundary_faces, points)
@@ -49,7 +49,7 @@ def _off(vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule) -> float:
 
 
 def chosen(problem: Problem) -> tuple[Fit, tuple[Alternative, ...]]:
-    """The fit of the kind that is asked for, or of that which predicts best.
+    """Return the fit of the kind that is asked for, or of that which predicts best.
 
     Beside it, where another kind predicts the points that were left out about as well, its answer
     with its weight.
@@ -72,7 +72,7 @@ def chosen(problem: Problem) -> tuple[Fit, tuple[Alternative, ...]]:
 
 
 def score(problem: Problem, kind: Kind) -> float:
-    """Root mean square distance of points from what the others predict of them [m]."""
+    """Return the root mean square distance of points from what the others predict of them [m]."""
     patches, square = patches_of(problem.points), []
     for number in range(_FOLDS):
         left = patches == number

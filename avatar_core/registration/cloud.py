@@ -37,9 +37,14 @@ _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(e[-+]?\d+)?", re.IGNORECASE)
 class Cloud:
     """Points on a deformed surface.
 
-    points : ndarray, shape (n, 3) [m], RAS; those that stand several times are kept once
-    name : of the file; ``unit`` that was applied
-    notices : what was left out, one line each
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3)
+        Points [m], RAS; those that stand several times are kept once.
+    name : str
+        Name of the file; ``unit`` that was applied.
+    notices : tuple[str, ...]
+        What was left out, one line each.
     """
 
     points: FloatArray
@@ -88,7 +93,7 @@ def _extent(points: FloatArray) -> float:
 
 
 def _different(points: FloatArray) -> IntArray:
-    """The first of all points that are the same, in their order, shape (n,)."""
+    """Return the first of all points that are the same, in their order, shape (n,)."""
     if len(points) == 0:
         return np.empty(0, dtype=np.int64)
     cell = max(_SAME * _extent(points), np.finfo(float).tiny)
@@ -103,9 +108,11 @@ def read_cloud(path: str | Path, unit: str = "mm", axes: str | ArrayLike | None 
 
     Parameters
     ----------
-    unit : "m", "cm" or "mm", of the file's coordinates
-    axes : where the file's +x, +y, +z point, or a rigid (4, 4) matrix to RAS, in the file's unit;
-        None: as the file's header states, RAS if it states none
+    unit : str
+        "m", "cm" or "mm", of the file's coordinates.
+    axes : str or array_like or None
+        Axes where the file's +x, +y, +z point, or a rigid (4, 4) matrix to RAS, in the file's unit;
+        None: as the file's header states, RAS if it states none.
 
     Raises
     ------
@@ -129,7 +136,7 @@ def read_cloud(path: str | Path, unit: str = "mm", axes: str | ArrayLike | None 
 
 
 def without_background(cloud: Cloud, vertices: FloatArray, faces: IntArray) -> Cloud:
-    """The cloud without points far off the organ, such as a table, with a notice.
+    """Return the cloud without points far off the organ, such as a table, with a notice.
 
     vertices, faces : of the organ's surface at rest, shapes (n, 3) [m] and (m, 3)
     """
@@ -181,7 +188,7 @@ def require_on_organ(
 
 
 def _fits_turned(cloud: Cloud, moved_off: Callable[[Cloud], float] | None) -> bool:
-    """Whether a rigid motion brings the cloud to the organ with x and y reversed alone."""
+    """Return whether a rigid motion brings the cloud to the organ with x and y reversed alone."""
     if moved_off is None:
         return True
     turned = replace(cloud, points=cloud.points * [-1.0, -1.0, 1.0])
@@ -189,7 +196,7 @@ def _fits_turned(cloud: Cloud, moved_off: Callable[[Cloud], float] | None) -> bo
 
 
 def _unit_hint(ratio: float, unit: str) -> str:
-    """Remedy for a cloud that is so many times as large as the organ in a unit."""
+    """Return the remedy for a cloud that is so many times as large as the organ in a unit."""
     raw = ratio / METRES[unit]
     for other in METRES:
         if other != unit and 2.0 * _LEAST_EXTENT <= raw * METRES[other] <= _MOST_EXTENT:
@@ -198,7 +205,7 @@ def _unit_hint(ratio: float, unit: str) -> str:
 
 
 def _points(path: Path, is_mesh: bool) -> FloatArray:
-    """Coordinates of a file, shape (n, 3), in its unit and axes."""
+    """Return the coordinates of a file, shape (n, 3), in its unit and axes."""
     try:
         if is_mesh:
             return parse(path, None)[0]
@@ -217,7 +224,7 @@ def _points(path: Path, is_mesh: bool) -> FloatArray:
 
 
 def _columns(name: str, content: bytes) -> FloatArray:
-    """The numbers in the columns x, y and z, or in the first three, shape (n, 3)."""
+    """Return the numbers in the columns x, y and z, or in the first three, shape (n, 3)."""
     is_wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")  # as spreadsheets write "Unicode text"
     text = content.decode("utf-16" if is_wide else "utf-8-sig", errors="replace")
     lines = [line for line in text.replace('"', "").splitlines() if line.strip()]
@@ -243,7 +250,7 @@ def _columns(name: str, content: bytes) -> FloatArray:
 
 
 def _words(line: str) -> list[str]:
-    """The fields of a line; a title keeps its unit, as in ``x [mm]``, to itself."""
+    """Return the fields of a line; a title keeps its unit, as in ``x [mm]``, to itself."""
     line = re.sub(r"[\[(].*?[\])]", "", line).strip().lstrip("#")
     if ";" in line:
         return [word.strip() for word in line.split(";")]

@@ -42,9 +42,14 @@ _BATCH = 300  # columns computed at once
 class LoadBasis:
     """Coefficients of loads, the forces that they stand for, and what they displace.
 
-    forces : ndarray, shape (n_positions, 3, n), at each load position [N] by each coefficient
-    columns : ndarray, shape (n_vertices, 3, n) [m], displacement by each coefficient
-    spread : prior standard deviations of the coefficients (n,) at a scale and a length [m]
+    Attributes
+    ----------
+    forces : ndarray, shape (n_positions, 3, n)
+        Forces at each load position [N] by each coefficient.
+    columns : ndarray, shape (n_vertices, 3, n)
+        Columns [m], displacement by each coefficient.
+    spread : Callable[[float, float], ndarray]
+        Prior standard deviations of the coefficients (n,) at a scale and a length [m].
     """
 
     forces: FloatArray
@@ -69,18 +74,18 @@ class LoadBasis:
         return LoadBasis(forces, columns, spread)
 
     def at_positions(self, coefficients: FloatArray) -> FloatArray:
-        """Forces at load positions, shape (n_positions, 3) [N]."""
+        """Return the forces at load positions, shape (n_positions, 3) [N]."""
         return np.asarray(self.forces @ coefficients)
 
     def displacement(self, coefficients: FloatArray) -> FloatArray:
-        """Displacement of the vertices, shape (n_vertices, 3) [m]."""
+        """Return the displacement of the vertices, shape (n_vertices, 3) [m]."""
         return np.asarray(self.columns @ coefficients)
 
 
 def smooth_loads(
     vademecum: Vademecum, allowed: FloatArray, along_normals: bool = False, n: int = N_FUNCTIONS
 ) -> LoadBasis:
-    """The smoothest tractions, and the turned weight; a pressure if along normals.
+    """Return the smoothest tractions, and the turned weight; a pressure if along normals.
 
     Parameters
     ----------
@@ -115,10 +120,16 @@ def smooth_loads(
 class PointForces:
     """Places at which a force may act, each alone.
 
-    positions : ndarray of int, shape (n,), load positions
-    columns : ndarray, shape (n_vertices, 3, n, 3) [m/N], by a force at each place
-    per_metre : ndarray, shape (n,), force that displaces the organ there by a unit [N/m]
-    n_positions : of the vademecum
+    Attributes
+    ----------
+    positions : ndarray of int, shape (n,)
+        Load positions.
+    columns : ndarray, shape (n_vertices, 3, n, 3)
+        Columns [m/N], by a force at each place.
+    per_metre : ndarray, shape (n,)
+        Force that displaces the organ there by a unit [N/m].
+    n_positions : int
+        n positions of the vademecum.
     """
 
     positions: IntArray
@@ -143,7 +154,7 @@ class PointForces:
         return cls(positions, columns, per_metre, vademecum.surface.n_positions)
 
     def basis(self, chosen: list[int]) -> LoadBasis:
-        """Forces at some of the places together."""
+        """Return the forces at some of the places together."""
         n = len(chosen)
         forces = np.zeros((self.n_positions, 3, 3 * n))
         for k, place in enumerate(chosen):
@@ -274,7 +285,7 @@ def _eigenfunctions(surface: LoadSurface, n: int) -> tuple[FloatArray, FloatArra
 
 
 def _triangles(surface: LoadSurface) -> IntArray:
-    """Triangles between all load positions: each face, or its four quarters."""
+    """Return the triangles between all load positions: each face, or its four quarters."""
     six = surface.face_positions
     if six.shape[1] == 3:
         return six

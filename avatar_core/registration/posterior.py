@@ -45,10 +45,18 @@ class Scales:
 class Equations:
     """The cloud's equations, as sums that do not depend on the scales.
 
-    gram : ndarray, shape (n, n), J^T W J; right : (n,), J^T W d; square : d^T W d
-    cell_rows : ndarray, shape (n_cells, n), sums of W J over cells; cell_right, cell_weight
-        likewise of W d and W
-    n_points, log_weights : number of points, sum of log W
+    Attributes
+    ----------
+    gram : ndarray, shape (n, n)
+        J^T W J.
+    right : ndarray
+        (n,), J^T W d.
+    square : float
+        d^T W d.
+    cell_rows : ndarray, shape (n_cells, n)
+        Sums of W J over cells; cell_right, cell_weight likewise of W d and W.
+    n_points, log_weights : int
+        Number of points, sum of log W.
     """
 
     gram: FloatArray
@@ -79,7 +87,7 @@ def equations(J: FloatArray, d: FloatArray, W: FloatArray, cells: sp.csr_matrix)
 
 
 def cells_of(points: FloatArray, size: float) -> sp.csr_matrix:
-    """Cubes of a size that hold points, sparse, shape (n_cells, n_points)."""
+    """Return the cubes of a size that hold points, sparse, shape (n_cells, n_points)."""
     _, cell = np.unique(np.floor(points / size).astype(int), axis=0, return_inverse=True)
     n = len(points)
     return sp.csr_matrix((np.ones(n), (cell.ravel(), np.arange(n))))
@@ -134,14 +142,14 @@ def posterior(found: Equations, spread: FloatArray, noise: float, mismatch: floa
 
 
 def at_scales(found: Equations, spread: Spread, scales: FloatArray) -> Posterior:
-    """The posterior at scales (traction, length, noise, mismatch)."""
+    """Return the posterior at scales (traction, length, noise, mismatch)."""
     return posterior(found, spread(scales), scales[2], scales[3])
 
 
 def likeliest(
     found: Equations, spread: Spread, prior: Scales, start: FloatArray, n_tries: int
 ) -> FloatArray:
-    """Logarithms of the scales that make the cloud likeliest, by the simplex method."""
+    """Return the logarithms of the scales that make the cloud likeliest, by the simplex method."""
     simplex = np.vstack([start, start + _SIMPLEX * np.eye(len(start))])
     options = {"maxfev": n_tries, "initial_simplex": simplex, "xatol": 0.02, "fatol": 0.05}
     return np.asarray(

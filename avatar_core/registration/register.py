@@ -43,11 +43,18 @@ _INSIDE = 5e-3  # of a target from the organ at most [m]
 class Estimate:
     """Where a point of the organ, or the middle of some, has gone.
 
-    name : what it is
-    rest, place : ndarray, shape (3,) [m], before, and now in the cloud's frame
-    displacement : ndarray, shape (3,) [m], by deformation, along the axes at rest
-    displacement_deviation, place_deviation : standard deviations along the axes, (3,) [m]
-    model_error : standard deviation of each from the vademecum's own error [m], part of both
+    Attributes
+    ----------
+    name : str
+        What it is.
+    rest, place : ndarray, shape (3,)
+        Rest and place [m], before, and now in the cloud's frame.
+    displacement : ndarray, shape (3,)
+        Displacement [m], by deformation, along the axes at rest.
+    displacement_deviation, place_deviation : ndarray
+        Standard deviations along the axes, (3,) [m].
+    model_error : float
+        Standard deviation of each from the vademecum's own error [m], part of both.
     """
 
     name: str
@@ -63,16 +70,27 @@ class Estimate:
 class Registered:
     """A vademecum registered to a cloud.
 
-    fit : Fit, its loads, motion and residuals
-    displacement : ndarray, shape (n_vertices, 3) [m], by deformation, along the axes at rest
-    place : ndarray, shape (n_vertices, 3) [m], of the vertices in the cloud's frame
-    displacement_spread, place_spread : ndarray, shape (n_vertices, 3, k) [m], square roots of the
-        posterior covariance, S S^T of any vertices together
-    model_error : relative, by the vademecum's certificate and by what small strains leave out
-    away : ndarray, shape (n_vertices,), of each place from the nearest point of the cloud [m]
-    within : bound of the rule, within which a place is determined [m]
-    problems : why the model does not explain the cloud, one line each; empty if it does
-    notices : what else there is to know, one line each
+    Attributes
+    ----------
+    fit : Fit
+        Its loads, motion and residuals.
+    displacement : ndarray, shape (n_vertices, 3)
+        Displacement [m], by deformation, along the axes at rest.
+    place : ndarray, shape (n_vertices, 3)
+        Place [m], of the vertices in the cloud's frame.
+    displacement_spread, place_spread : ndarray, shape (n_vertices, 3, k)
+        Displacement spread and place spread [m], square roots of the posterior covariance, S S^T of
+        any vertices together.
+    model_error : float
+        Relative, by the vademecum's certificate and by what small strains leave out.
+    away : ndarray, shape (n_vertices,)
+        Away of each place from the nearest point of the cloud [m].
+    within : float
+        Bound of the rule, within which a place is determined [m].
+    problems : tuple[str, ...]
+        Why the model does not explain the cloud, one line each; empty if it does.
+    notices : tuple[str, ...]
+        What else there is to know, one line each.
     """
 
     fit: Fit
@@ -166,7 +184,8 @@ class Registered:
 
         Parameters
         ----------
-        vertices : ndarray of int, shape (n,); weights : ndarray, shape (n,)
+        vertices : ndarray of int, shape (n,)
+        weights : ndarray, shape (n,)
         """
         own = float(weights @ self.model_deviation[vertices])
 
@@ -243,7 +262,7 @@ def cloud_part(points: FloatArray) -> FloatArray:
 
 
 def targets(vademecum: Vademecum, registered: Registered) -> list[Estimate]:
-    """The middles of structures inside, such as tumours."""
+    """Return the middles of structures inside, such as tumours."""
     display, found = vademecum.display, []
     for name, faces in vademecum.structures.items():
         assert display is not None
@@ -254,7 +273,7 @@ def targets(vademecum: Vademecum, registered: Registered) -> list[Estimate]:
 
 
 def target_at(vademecum: Vademecum, registered: Registered, point: FloatArray) -> Estimate:
-    """A point of the organ at rest [m].
+    """Return a point of the organ at rest [m].
 
     Raises
     ------
@@ -272,7 +291,7 @@ def target_at(vademecum: Vademecum, registered: Registered, point: FloatArray) -
 
 
 def largest(registered: Registered) -> Estimate:
-    """The vertex that the deformation displaces most."""
+    """Return the vertex that the deformation displaces most."""
     vertex = int((registered.displacement**2).sum(axis=1).argmax())
     return registered.estimate("largest displacement", np.array([vertex]), np.ones(1))
 
@@ -288,7 +307,7 @@ class PlaceForce:
 def strongest_forces(
     vademecum: Vademecum, registered: Registered, n: int = 3
 ) -> tuple[PlaceForce, ...]:
-    """Forces within two patch radii of the places that are pressed or pulled hardest."""
+    """Return the forces within two patch radii of the places that are pressed or pulled hardest."""
     surface, found = vademecum.surface, registered.fit
     forces = found.loads.at_positions(found.coefficients)
     reach = 2.0 * surface.patch_radius
@@ -299,7 +318,7 @@ def strongest_forces(
 
 
 def _roots(vademecum: Vademecum, found: Fit) -> FloatArray:
-    """R with R R^T ~ the covariance, shape (n + 6, k): what moves the surface alone."""
+    """Return R with R R^T ~ the covariance, shape (n + 6, k): what moves the surface alone."""
     size = np.sqrt(np.maximum(np.diagonal(found.covariance), np.finfo(float).tiny))
     value, vector = np.linalg.eigh(found.covariance / np.outer(size, size))  # alike in unit
     half = size[:, None] * vector * np.sqrt(np.maximum(value, 0.0))

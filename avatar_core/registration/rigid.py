@@ -14,8 +14,14 @@ from avatar_core.common.arrays import FloatArray
 class RigidMotion:
     """Rotation by a vector about a centre, then a translation.
 
-    centre : ndarray, shape (3,) [m]
-    turn : ndarray, shape (3,), rotation vector [rad]; shift : ndarray, shape (3,) [m]
+    Attributes
+    ----------
+    centre : ndarray, shape (3,)
+        Centre [m].
+    turn : ndarray, shape (3,)
+        Rotation vector [rad].
+    shift : ndarray, shape (3,)
+        Shift [m].
     """
 
     centre: FloatArray
@@ -38,15 +44,15 @@ class RigidMotion:
         return np.asarray(moved)
 
     def back(self, points: FloatArray) -> FloatArray:
-        """The inverse motion of points, shape (n, 3) [m]."""
+        """Return the inverse motion of points, shape (n, 3) [m]."""
         return np.asarray(self.centre + (points - self.shift - self.centre) @ self.matrix)
 
     def with_unknowns(self, unknowns: FloatArray) -> RigidMotion:
-        """Another motion about the same centre."""
+        """Return the another motion about the same centre."""
         return RigidMotion(self.centre, unknowns[:3], unknowns[3:])
 
     def rows(self, points: FloatArray, normals: FloatArray) -> FloatArray:
-        """Derivatives of moved points along normals by the unknowns, shape (n, 6).
+        """Return the derivatives of moved points along normals by the unknowns, shape (n, 6).
 
         To first order in the change of the turn, which is taken for one about the same axis.
         """

@@ -28,8 +28,13 @@ _GAIN = 5.0  # of the log likelihood, that one more force needs
 class Noise:
     """The error of the cloud: E^-1 without a dense matrix; see :mod:`posterior`.
 
-    weights : ndarray, shape (n_points,); cells : sparse, (n_cells, n_points)
-    noise, mismatch : sigma, tau [m]
+    Attributes
+    ----------
+    weights : ndarray, shape (n_points,)
+    cells : sp.csr_matrix
+        Sparse, (n_cells, n_points).
+    noise, mismatch : float
+        Sigma, tau [m].
     """
 
     weights: FloatArray
@@ -49,7 +54,8 @@ class Noise:
 @dataclass(frozen=True, eq=False)
 class Found:
     """chosen : places, the likeliest first; gain : ndarray, shape (n_places,), log likelihood of
-    a force at each place in that of the first, given the others."""
+    a force at each place in that of the first, given the others.
+    """
 
     chosen: list[int]
     gain: FloatArray
@@ -58,7 +64,7 @@ class Found:
 def find_sites(
     common: FloatArray, rows: FloatArray, data: FloatArray, error: Noise, most: int = MOST_FORCES
 ) -> Found:
-    """Places of forces that explain a cloud.
+    """Return the places of forces that explain a cloud.
 
     Parameters
     ----------
@@ -100,7 +106,7 @@ class _Weighed:
     error: Noise
 
     def gains(self, others: FloatArray) -> FloatArray:
-        """Log likelihood that a force at each place adds to others, rows (n_points, m)."""
+        """Return log likelihood that a force at each place adds to others, rows (n_points, m)."""
         A, B = self.error.weighed(others)
         gram = A.T @ A - B.T @ B + np.eye(A.shape[1])
         known = (A.T @ self.value[0] - B.T @ self.value[1])[:, 0]

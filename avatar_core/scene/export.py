@@ -54,7 +54,7 @@ def export(
 def organ_mesh(
     vademecum: Vademecum, point: ArrayLike, force: ArrayLike, n_modes: int = 10
 ) -> meshio.Mesh:
-    """The mesh at rest [m] with point data.
+    """Return the mesh at rest [m] with point data.
 
     "displacement [m]" (n_vertices, 3) under a force, by :meth:`Vademecum.displacement_at`;
     mode_001 and so on, (n_vertices, 3), as in the file; clamped, accessible (n_vertices,), 1 on

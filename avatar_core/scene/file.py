@@ -48,12 +48,12 @@ _KEYS = ("name", "text", "organ", "material", "tools", "outputs", "effects")
 
 
 def shipped_scenes() -> dict[str, Path]:
-    """Files of the scenes that come with the project, by name without suffix; sorted."""
+    """Return the files of the scenes that come with the project, by name without suffix; sorted."""
     return shipped(SHIPPED)
 
 
 def shipped_scene(name: str) -> Path:
-    """The file of a scene that comes with the project, by name, with or without ``.yaml``.
+    """Return the file of a scene that comes with the project, by name, with or without ``.yaml``.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def shipped_scene(name: str) -> Path:
 
 
 def scene_path(name: str) -> Path:
-    """The file of a scene: a path, or the name of a shipped scene.
+    """Return the file of a scene: a path, or the name of a shipped scene.
 
     Raises SceneError as :func:`shipped_scene`, for a name without folder and suffix.
     """
@@ -86,13 +86,16 @@ def read_scene(path: str | Path) -> Scene:
 
 
 def parse_scene(text: str, source: str, folder: Path | None = None) -> Scene:
-    """The scene that YAML text describes; a key without a value keeps its default.
+    """Return the scene that YAML text describes; a key without a value keeps its default.
 
     Parameters
     ----------
-    text : YAML
-    source : its name in error messages
-    folder : in which files that it names must lie; None if it may name none
+    text : str
+        YAML.
+    source : str
+        Its name in error messages.
+    folder : Path or None
+        Folder in which files that it names must lie; None if it may name none.
 
     Raises
     ------
@@ -118,7 +121,7 @@ def parse_scene(text: str, source: str, folder: Path | None = None) -> Scene:
 
 
 def write_scene(scene: Scene) -> str:
-    """YAML text that :func:`parse_scene` reads as an equal scene; it names no other file."""
+    """Return YAML text that :func:`parse_scene` reads as an equal scene; it names no other file."""
     document: dict[str, Any] = {"name": scene.name, "text": scene.text}
     for section, keys in SECTIONS.items():
         values = {key: getattr(scene, key) for key in keys}
@@ -140,13 +143,13 @@ def _plain_tool(tool: Tool) -> dict[str, Any]:
 
 
 def _plain_fields(one: Any) -> dict[str, Any]:
-    """The fields of a dataclass that have a value."""
+    """Return the fields of a dataclass that have a value."""
     values = {field.name: getattr(one, field.name) for field in fields(one)}
     return {name: plain(value) for name, value in values.items() if value is not None}
 
 
 def _fields(owner: type, entries: Entries, path: str) -> dict[str, Any]:
-    """Values of the fields of a dataclass; fields without a value are left out."""
+    """Return the values of the fields of a dataclass; fields without a value are left out."""
     return {
         key: _value(node, below(path, key), owner, key)
         for key, (_, node) in entries.items()
@@ -155,7 +158,7 @@ def _fields(owner: type, entries: Entries, path: str) -> dict[str, Any]:
 
 
 def _value(node: Node, path: str, owner: type, key: str) -> Any:
-    """The value of a node, of the type that the field has."""
+    """Return the value of a node, of the type that the field has."""
     kind = get_type_hints(owner)[key]
     if kind == tuple[SupportStiffness, ...]:
         return _supports(node, path)
@@ -172,7 +175,7 @@ def _value(node: Node, path: str, owner: type, key: str) -> Any:
 
 
 def _supports(node: Node, path: str) -> tuple[SupportStiffness, ...]:
-    """A mapping of the supports' names to their stiffnesses."""
+    """Return a mapping of the supports' names to their stiffnesses."""
     if not isinstance(node, MappingNode):
         raise refused(node, f"{path} is {shown(node)}; write {{bare_area: 1e6}}, [N/m^3]")
     (field,) = (f for f in fields(SupportStiffness) if f.name == "stiffness")
@@ -209,7 +212,7 @@ def _line(node: Node, path: str) -> str:
 
 
 def _choice(node: Node, path: str, choices: Sequence[str]) -> str:
-    """One of several words, as written: YAML 1.1 reads off as false."""
+    """Return one of several words, as written: YAML 1.1 reads off as false."""
     if not isinstance(node, ScalarNode) or node.value not in choices:
         raise refused(node, f"{path} is {shown(node)}; it must be one of {', '.join(choices)}")
     return node.value
@@ -239,7 +242,7 @@ def _tool(node: Node, path: str, known: Sequence[str]) -> Tool:
 
 
 def _part(kind: type, node: Node, path: str, **given: Any) -> Any:
-    """A tip or a jaw: its numbers, and what is given beside them."""
+    """Return a tip or a jaw: its numbers, and what is given beside them."""
     known = [field.name for field in fields(kind) if field.name not in ("grasp", *given)]
     values = _fields(kind, entries_of(node, path, known), path)
     with placed_at(node):
@@ -247,7 +250,7 @@ def _part(kind: type, node: Node, path: str, **given: Any) -> Any:
 
 
 def _effects(node: Node, folder: Path | None) -> tuple[Effect, ...]:
-    """Effects from a mapping, or from a list of names and mappings of one key."""
+    """Return the effects from a mapping, or from a list of names and mappings of one key."""
     if isinstance(node, SequenceNode):
         pairs = [_named(item) for item in node.value]
     elif isinstance(node, MappingNode):

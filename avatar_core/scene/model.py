@@ -196,7 +196,10 @@ class Scene:
 class Combination:
     """Two effects that do not simply superpose, and how they are combined.
 
-    error : mean error of the combination over unseen cases [-]; None if not measured
+    Attributes
+    ----------
+    error : float or None
+        Mean error of the combination over unseen cases [-]; None if not measured.
     """
 
     effects: tuple[str, str]
@@ -220,7 +223,7 @@ _WITH_LARGE = (
 
 
 def combinations(scene: Scene, vademecum: Vademecum | None) -> tuple[Combination, ...]:
-    """Pairs of effects of a scene that do not superpose, with errors if an organ is given.
+    """Return pairs of effects of a scene that do not superpose, with errors if an organ is given.
 
     Only large deformation does not superpose. With one tool, several_tools is ignored.
     """
@@ -238,7 +241,7 @@ def combinations(scene: Scene, vademecum: Vademecum | None) -> tuple[Combination
 
 
 def _figure(certificate: Any, key: str | None) -> float | None:
-    """A figure of a certificate; None if it was not measured."""
+    """Return a figure of a certificate; None if it was not measured."""
     value = getattr(certificate, key) if certificate and key else None
     return None if value is None or math.isnan(value) else float(value)
 

@@ -23,9 +23,14 @@ from avatar_core.vademecum.model import Vademecum
 class ModelSpec:
     """What a scene makes of a vademecum.
 
-    vademecum : at the values chosen for its material
-    tips : of the tools
-    modes : of the displacement at most; None for all
+    Attributes
+    ----------
+    vademecum : Vademecum
+        Vademecum at the values chosen for its material.
+    tips : tuple[Tip, ...]
+        Tips of the tools.
+    modes : int or None
+        Modes of the displacement at most; None for all.
     """
 
     vademecum: Vademecum
@@ -52,7 +57,7 @@ class ModelSpec:
         return curve and curve.of(self.cloud).up_to(self.finest.modes)
 
     def layout(self, detail: Detail, period: float) -> Any:
-        """The arrays of a contact model that shows a detail."""
+        """Return the arrays of a contact model that shows a detail."""
         return lay_out(self.vademecum, self.tips, detail, self.effects, period)
 
 
@@ -65,7 +70,10 @@ def default_spec(
 ) -> ModelSpec:
     """Without a scene: the default effects of the vademecum and the number of tools.
 
-    values : of the material, by coordinate
+    Parameters
+    ----------
+    values : Mapping[str, float] or None
+        Values of the material, by coordinate.
     """
     chosen = at_values(vademecum, values or {})
     return ModelSpec(chosen, tips, modes, cloud, default_effects(chosen, tips))
@@ -76,7 +84,10 @@ def scene_spec(
 ) -> ModelSpec:
     """What a scene makes of a vademecum.
 
-    values : of the material, by coordinate; they override those of the scene
+    Parameters
+    ----------
+    values : Mapping[str, float] or None
+        Values of the material, by coordinate; they override those of the scene.
 
     Raises
     ------

@@ -11,7 +11,7 @@ from avatar_core.errors import SceneError
 
 
 def parse_prony(text: str, source: str) -> dict[str, tuple[float, ...]]:
-    """``g`` and ``tau`` of comma-separated text; empty lines, and text after #, are ignored.
+    """Return ``g`` and ``tau`` of comma-separated text; empty lines, and text after #, are ignored.
 
     A header must read ``g, tau``, so that exchanged columns are noticed.
 
@@ -36,7 +36,7 @@ def parse_prony(text: str, source: str) -> dict[str, tuple[float, ...]]:
 
 
 def _is_header(cells: list[str]) -> bool:
-    """Units may follow the two words, as in ``g [-], tau [s]``."""
+    """Return the units may follow the two words, as in ``g [-], tau [s]``."""
     return [cell.partition(" ")[0].lower() for cell in cells] == ["g", "tau"]
 
 

@@ -78,11 +78,18 @@ class Clouds:
 class Recording:
     """A tool's path over an organ, the forces on it, and the displacements of the organ.
 
-    vademecum_id : SHA-256 of the vademecum's file
-    vademecum_name : name of the organ, for messages
-    scene : YAML text: tips, effects and material in force
-    rate : nominal rate of the loop [Hz]
-    from_rest : whether the model was new and untouched before the first period
+    Attributes
+    ----------
+    vademecum_id : str
+        SHA-256 of the vademecum's file.
+    vademecum_name : str
+        Name of the organ, for messages.
+    scene : str
+        YAML text: tips, effects and material in force.
+    rate : float
+        Nominal rate of the loop [Hz].
+    from_rest : bool
+        Whether the model was new and untouched before the first period.
     """
 
     vademecum_id: str
@@ -163,7 +170,7 @@ def _attributes_of(held: dict[str, str], origin: str) -> dict[str, str]:
 
 
 def _rate(text: str) -> float:
-    """A positive number, or NaN."""
+    """Return a positive number, or NaN."""
     try:
         rate = float(text)
     except ValueError:

@@ -40,15 +40,19 @@ _MAY_BE_INSIDE = (int(Status.OUT_OF_RANGE), int(Status.INVALID_POSE))
 class Replayed:
     """Forces of the organ on the recorded tips.
 
-    force : ndarray, shape (n, n_tools, 3) [N]
-    known : ndarray of bool, shape (n,), where they must equal the recorded ones
+    Attributes
+    ----------
+    force : ndarray, shape (n, n_tools, 3)
+        Force [N].
+    known : ndarray of bool, shape (n,)
+        Known where they must equal the recorded ones.
     """
 
     force: np.ndarray
     known: np.ndarray
 
     def difference(self, recording: Recording) -> float:
-        """Largest difference of a force in known periods [N]; NaN if no period is known."""
+        """Return largest difference of a force in known periods [N]; NaN if no period is known."""
         if not self.known.any():
             return float("nan")
         gap = self.force[self.known] - recording.periods.force[self.known]
@@ -60,7 +64,10 @@ def replay(
 ) -> Replayed:
     """Compute the forces along the path of a recording with a new model.
 
-    progress : called with the periods that are computed, and how many there are
+    Parameters
+    ----------
+    progress : Callable[[int, int], None] or None
+        Called with the periods that are computed, and how many there are.
 
     Raises
     ------

@@ -36,11 +36,15 @@ def write_surfaces(
 
     Parameters
     ----------
-    path : .stl, .obj or .vtp, of the organ
-    points : ndarray, shape (n, 3), displayed vertices where they are now [m]; see :func:`displaced`
-    unit, axes : of what is written
-    fields : values at displayed vertices, shape (n,), or vectors along RAS, (n, 3); .vtp alone
-        holds them, vectors along its own axes
+    path : str or Path
+        .stl, .obj or .vtp, of the organ.
+    points : ndarray, shape (n, 3)
+        Displayed vertices where they are now [m]; see :func:`displaced`.
+    unit, axes : str
+        Unit and axes of what is written.
+    fields : Fields or None
+        Values at displayed vertices, shape (n,), or vectors along RAS, (n, 3); .vtp alone holds
+        them, vectors along its own axes.
 
     Returns
     -------
@@ -76,12 +80,12 @@ def write_surfaces(
 
 
 def displaced(vademecum: Vademecum, displacement: np.ndarray) -> np.ndarray:
-    """Displayed vertices moved by a displacement of the mesh, shape (n, 3) [m]."""
+    """Return the displayed vertices moved by a displacement of the mesh, shape (n, 3) [m]."""
     return np.asarray(vademecum.surface_vertices + carried(vademecum, displacement), float)
 
 
 def carried(vademecum: Vademecum, values: np.ndarray) -> np.ndarray:
-    """Values at vertices of the mesh, (n_vertices, ...), taken to the displayed ones."""
+    """Return the values at vertices of the mesh, (n_vertices, ...), taken to the displayed ones."""
     display = vademecum.display
     if display is None:
         return np.asarray(values[vademecum.mesh.surface_vertices])
@@ -89,7 +93,7 @@ def carried(vademecum: Vademecum, values: np.ndarray) -> np.ndarray:
 
 
 def _plain(name: str) -> str:
-    """A name without letters that files must not have."""
+    """Return a name without letters that files must not have."""
     return "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in name)
 
 
@@ -139,7 +143,7 @@ def _write_vtp(
 
 
 def _point_data(fields: Fields) -> str:
-    """Fields as VTK's point data; nothing where there are none."""
+    """Return the fields as VTK's point data; nothing where there are none."""
     arrays = []
     for name, value in fields.items():
         rows = value.reshape(len(value), -1)

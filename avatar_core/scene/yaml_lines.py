@@ -32,7 +32,7 @@ Entries = dict[str, tuple[Node, Node]]  # by key: the nodes of the key and of it
 
 
 def read_text(path: Path) -> str:
-    """The text of a small, ordinary file; others are not opened.
+    """Return the text of a small, ordinary file; others are not opened.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def read_text(path: Path) -> str:
 
 
 def compose(text: str, source: str) -> Node:
-    """The root node of one YAML document.
+    """Return the root node of one YAML document.
 
     Raises
     ------
@@ -105,7 +105,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def refused(place: Any, message: str) -> SceneError:
-    """An error that names file and line of a node or an event."""
+    """Return an error that names file and line of a node or an event."""
     mark = place.start_mark
     return SceneError(f"{mark.name}:{mark.line + 1}: {message}")
 
@@ -120,7 +120,7 @@ def placed_at(node: Node) -> Iterator[None]:
 
 
 def entries_of(node: Node, owner: str, known: Sequence[str]) -> Entries:
-    """The entries of a mapping; see :func:`checked`."""
+    """Return the entries of a mapping; see :func:`checked`."""
     if not isinstance(node, MappingNode):
         wanted = (
             f"write 'key: value' below it, of {', '.join(known)}" if known else "it has no settings"
@@ -130,7 +130,7 @@ def entries_of(node: Node, owner: str, known: Sequence[str]) -> Entries:
 
 
 def checked(pairs: Iterable[tuple[Node, Node]], owner: str, known: Sequence[str]) -> Entries:
-    """Entries; raises SceneError for an unknown key or one that is given twice."""
+    """Return the entries; raises SceneError for an unknown key or one that is given twice."""
     found: Entries = {}
     for key, value in pairs:
         path = below(owner, shown(key))
@@ -152,22 +152,22 @@ def _instead(word: str, known: Sequence[str]) -> str:
 
 
 def below(owner: str, key: str) -> str:
-    """The path of a key in error messages."""
+    """Return the path of a key in error messages."""
     return f"{owner}.{key}" if owner else key
 
 
 def nothing_at(node: Node) -> Node:
-    """A node without a value, at the position of another."""
+    """Return a node without a value, at the position of another."""
     return ScalarNode(_NULL, "", node.start_mark, node.end_mark)
 
 
 def is_nothing(node: Node) -> bool:
-    """Whether a key has no value."""
+    """Return whether a key has no value."""
     return bool(node.tag == _NULL)
 
 
 def shown(node: Node) -> str:
-    """A node for an error message: short and in one line."""
+    """Return a node for an error message: short and in one line."""
     if not isinstance(node, ScalarNode):
         return "a list" if isinstance(node, SequenceNode) else "a mapping"
     text = " ".join(node.value.split())[:40]

@@ -26,14 +26,23 @@ SAME = 1e-6  # vectors closer than this times the size of the base are equal: 0.
 class Barycenter:
     """One shape as x ~ sum_j w_j X_j with sum_j w_j = 1, and measures of how far to trust it.
 
-    neighbors : ndarray of int, shape (k,), nearest first; weights : ndarray, shape (k,)
-    distances : ndarray, shape (k,), |x - X_j|, in the unit of the vectors (2-norm)
-    residual : |x - sum_j w_j X_j|
-    hull_distance : distance of x from the convex hull of the neighbours; 0 inside
-    condition : number of the local Gram matrix before regularisation; inf if singular, 1 for a
-        member
-    member : number of the member that equals x and has weight 1; None if there is none
-    notices : how the result differs from the request, one line each
+    Attributes
+    ----------
+    neighbors : ndarray of int, shape (k,)
+        Nearest first.
+    weights : ndarray, shape (k,)
+    distances : ndarray, shape (k,)
+        |x - X_j|, in the unit of the vectors (2-norm).
+    residual : float
+        |x - sum_j w_j X_j|.
+    hull_distance : float
+        Distance of x from the convex hull of the neighbours; 0 inside.
+    condition : float
+        Number of the local Gram matrix before regularisation; inf if singular, 1 for a member.
+    member : int or None
+        Number of the member that equals x and has weight 1; None if there is none.
+    notices : tuple[str, ...]
+        How the result differs from the request, one line each.
     """
 
     neighbors: IntArray
@@ -53,7 +62,10 @@ class Barycenter:
     def combine(self, values: Sequence[ArrayLike] | FloatArray) -> FloatArray:
         """Eq. 18, sum_j w_j values[j]; a member of the base gets exactly its own value.
 
-        values : one array per member of the base, all of the same shape
+        Parameters
+        ----------
+        values : Sequence[array_like] or ndarray
+            One array per member of the base, all of the same shape.
         """
         if self.member is not None:
             return np.array(values[self.member], dtype=np.float64)
@@ -65,7 +77,7 @@ class Barycenter:
 
 
 def local_gram(point: FloatArray, neighbors: Vectors) -> FloatArray:
-    """C_jk = (X_j - x) . (X_k - x), from differences, shape (k, k)."""
+    """Return C_jk = (X_j - x) . (X_k - x), from differences, shape (k, k)."""
     difference = np.empty((len(neighbors), len(point)))
     for row, neighbor in zip(difference, neighbors, strict=True):
         np.subtract(neighbor, point, out=row)  # five times faster than stacking differences
@@ -73,13 +85,17 @@ def local_gram(point: FloatArray, neighbors: Vectors) -> FloatArray:
 
 
 def barycenter_weights(gram: FloatArray, regularization: float) -> FloatArray:
-    """Weights of Eq. 15: min w^T C w with sum w = 1, from (C + r tr(C) I) w ~ 1.
-
-    gram : ndarray, shape (..., k, k), local Gram matrices C
-    regularization : r > 0, part of the trace added to the diagonal; divides weight evenly among
-        equal neighbours, and keeps the condition number below 1 / r
+    """Return the weights of Eq. 15: min w^T C w with sum w = 1, from (C + r tr(C) I) w ~ 1.
 
     Returns ndarray, shape (..., k). Raises LLEError if r lies outside (0, 1].
+
+    Parameters
+    ----------
+    gram : ndarray, shape (..., k, k)
+        Local Gram matrices C.
+    regularization : float
+        r > 0, part of the trace added to the diagonal; divides weight evenly among equal
+        neighbours, and keeps the condition number below 1 / r.
     """
     require_regularization(regularization)
     k = gram.shape[-1]
@@ -92,7 +108,7 @@ def barycenter_weights(gram: FloatArray, regularization: float) -> FloatArray:
 
 
 def convex_weights(gram: FloatArray) -> FloatArray:
-    """Weights w >= 0, sum w = 1, of the point of the convex hull closest to x, shape (k,).
+    """Return weights w >= 0, sum w = 1, of the point of the convex hull closest to x, shape (k,).
 
     With C = A^T A, the non-negative least squares min |A v|^2 + (1 - sum v)^2 has its minimum at
     v = w t: along a ray t w it is q / (1 + q), which grows with q = w^T C w.
@@ -118,16 +134,24 @@ def barycenter(
     convex: bool = False,
     leave_out: Collection[int] = (),
 ) -> Barycenter:
-    """Barycentric weights of a point in a base (Eq. 15), out of sample or leave-one-out.
-
-    vectors : the base, n arrays of shape (D,); point : shape (D,)
-    n_neighbors : k, truncated to the size of the base with a notice
-    convex : non-negative weights; regularization is then not used
-    leave_out : members that get no weight, such as other scans of the same patient
+    """Return the barycentric weights of a point in a base (Eq. 15), out of sample or leave-one-out.
 
     A point equal to a member has weight 1 on it (the first, if several are equal), 0 on the others.
 
     Raises LLEError if the base is empty, k <= 0, a value is not finite or lengths differ.
+
+    Parameters
+    ----------
+    vectors : Vectors
+        The base, n arrays of shape (D,).
+    point : array_like
+        Shape (D,).
+    n_neighbors : int
+        k, truncated to the size of the base with a notice.
+    convex : bool
+        Non-negative weights; regularization is then not used.
+    leave_out : Collection[int]
+        Members that get no weight, such as other scans of the same patient.
     """
     x = checked_vector(point, vectors)
     require_regularization(regularization)
@@ -158,7 +182,7 @@ def barycenter(
 
 
 def _distances(vectors: Vectors, candidates: IntArray, x: FloatArray) -> FloatArray:
-    """|x - X_j| of some members, shape (len(candidates),)."""
+    """Return |x - X_j| of some members, shape (len(candidates),)."""
     distance = np.array([_distance(vectors[j], x) for j in candidates])
     if not np.isfinite(distance).all():
         bad = candidates[~np.isfinite(distance)][0]
@@ -177,7 +201,7 @@ def _distance_to(x: FloatArray, neighbors: list[FloatArray], weights: FloatArray
 
 
 def _condition(gram: FloatArray) -> float:
-    """Condition number; inf if the smallest eigenvalue is within rounding of 0."""
+    """Return the condition number; inf if the smallest eigenvalue is within rounding of 0."""
     values = np.linalg.eigvalsh(gram)
     noise = len(gram) * np.finfo(float).eps * values[-1]
     return float(values[-1] / values[0]) if values[0] > noise else float("inf")
@@ -210,7 +234,7 @@ def require_regularization(regularization: float) -> None:
 
 
 def _truncated(n_neighbors: int, available: int) -> tuple[int, tuple[str, ...]]:
-    """Number of neighbours to use, and a notice if it is less than requested."""
+    """Return the number of neighbours to use, and a notice if it is less than requested."""
     if n_neighbors <= 0:
         raise LLEError(f"lle: {n_neighbors} neighbours asked for; choose at least 1")
     if available == 0:
@@ -221,5 +245,5 @@ def _truncated(n_neighbors: int, available: int) -> tuple[int, tuple[str, ...]]:
 
 
 def truncation(asked: int, available: int) -> str:
-    """Notice that fewer neighbours are used than were asked for."""
+    """Return the notice that fewer neighbours are used than were asked for."""
     return f"{asked} neighbours asked for, {available} used: the base has no more"

@@ -27,7 +27,7 @@ _PIECES = 3  # a patient's face is split into 3^2 pieces, whose majority decides
 
 
 def carry_regions(registration: Registration, patient: TetMesh) -> Regions:
-    """Clamped and accessible faces of the patient's mesh, from those of the template.
+    """Return the clamped and accessible faces of the patient's mesh, from those of the template.
 
     Accessible faces that touch the clamp and islands below 5 % of the accessible area are dropped,
     as by the anatomical rule. Parameters and errors as of :func:`carry_faces`; RegistrationError
@@ -58,8 +58,10 @@ def carry_faces(
     Parameters
     ----------
     registration : Registration
-    patient : TetMesh of the surface that was registered to
-    parts : ndarrays of bool over the template's boundary faces
+    patient : TetMesh
+        TetMesh of the surface that was registered to.
+    parts : Mapping[str, ndarray of bool]
+        Ndarrays of bool over the template's boundary faces.
 
     Raises
     ------
@@ -107,15 +109,17 @@ def registered_positions(registration: Registration, loads: LoadSurface) -> Floa
 
 
 def interpolation_matrix(mesh: TetMesh, points: FloatArray) -> sp.csr_matrix:
-    """Interpolation of nodal fields of a mesh at points.
+    """Return the interpolation of nodal fields of a mesh at points.
 
     Points in a tetrahedron take its barycentric coordinates, points outside those of the closest
     point of the surface.
 
     Parameters
     ----------
-    mesh : TetMesh, for instance the registered template
-    points : ndarray, shape (n, 3) [m], for instance the vertices of the patient's own mesh
+    mesh : TetMesh
+        Mesh for instance the registered template.
+    points : ndarray, shape (n, 3)
+        Points [m], for instance the vertices of the patient's own mesh.
 
     Returns
     -------
@@ -128,7 +132,7 @@ def interpolation_matrix(mesh: TetMesh, points: FloatArray) -> sp.csr_matrix:
 
 
 def load_map(registration: Registration, loads: LoadSurface, points: FloatArray) -> sp.csr_matrix:
-    """Interpolation from the template's load positions to points of the patient's surface.
+    """Return interpolation from the template's load positions to points of the patient's surface.
 
     Uses the shape functions of the loads, at the closest point of the registered template's
     accessible faces.
@@ -136,8 +140,10 @@ def load_map(registration: Registration, loads: LoadSurface, points: FloatArray)
     Parameters
     ----------
     registration : Registration
-    loads : LoadSurface of the template's mesh and regions
-    points : ndarray, shape (n, 3) [m]
+    loads : LoadSurface
+        LoadSurface of the template's mesh and regions.
+    points : ndarray, shape (n, 3)
+        Points [m].
 
     Returns
     -------

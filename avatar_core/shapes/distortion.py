@@ -24,7 +24,8 @@ class Distortion:
 
     Parameters
     ----------
-    reference : ndarray, shape (n_vertices, 3) [m], positively oriented with ``tets``
+    reference : ndarray, shape (n_vertices, 3)
+        Reference [m], positively oriented with ``tets``.
     tets : ndarray of int, shape (n_tets, 4)
     """
 
@@ -65,7 +66,7 @@ class Distortion:
         hessian.data[np.searchsorted(self._entries, rows * n + other.indices)] += other.data
 
     def deformation_gradient(self, positions: FloatArray) -> FloatArray:
-        """F of each tetrahedron, shape (n_tets, 3, 3)."""
+        """Return F of each tetrahedron, shape (n_tets, 3, 3)."""
         return np.swapaxes(positions[self.tets], 1, 2) @ self._gradients
 
     def jacobians(self, positions: FloatArray) -> FloatArray:
@@ -73,7 +74,7 @@ class Distortion:
         return np.linalg.det(self.deformation_gradient(positions))
 
     def energy(self, positions: FloatArray) -> float:
-        """W(x), infinite if a tetrahedron is flat or inverted."""
+        """Return W(x), infinite if a tetrahedron is flat or inverted."""
         return float(_energy(self.deformation_gradient(positions), self._weight))
 
     def derivatives(self, positions: FloatArray) -> tuple[FloatArray, sp.csr_matrix]:

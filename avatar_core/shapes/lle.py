@@ -41,9 +41,13 @@ LOCAL_VARIANCE = 0.99  # part of the variance that the counted principal compone
 class Gram:
     """Inner products of a base about a fixed origin, from which all distances follow.
 
-    origin : ndarray, shape (D,), the mean of the first members, which keeps the products and their
-        rounding small; it does not move when the base grows
-    products : ndarray, shape (n, n), G_ij = (X_i - o) . (X_j - o)
+    Attributes
+    ----------
+    origin : ndarray, shape (D,)
+        The mean of the first members, which keeps the products and their rounding small; it does
+        not move when the base grows.
+    products : ndarray, shape (n, n)
+        G_ij = (X_i - o) . (X_j - o).
     """
 
     origin: FloatArray
@@ -51,7 +55,7 @@ class Gram:
 
     @classmethod
     def of(cls, vectors: Vectors) -> Gram:
-        """All products of n vectors of shape (D,), summed over blocks of values."""
+        """Return all products of n vectors of shape (D,), summed over blocks of values."""
         n, length = len(vectors), len(vectors[0])
         origin, products = np.empty(length), np.zeros((n, n))
         for start in range(0, length, BLOCK):
@@ -68,12 +72,12 @@ class Gram:
         return np.diag(self.products)
 
     def squared_distances(self, rows: IntArray) -> FloatArray:
-        """|X_i - X_j|^2 for some i and all j, shape (len(rows), n)."""
+        """Return |X_i - X_j|^2 for some i and all j, shape (len(rows), n)."""
         lengths = self.squared_lengths
         return np.maximum(lengths[rows, None] + lengths - 2 * self.products[rows], 0.0)
 
     def grown(self, vectors: Vectors, point: FloatArray) -> Gram:
-        """The matrix with one more row, for a point appended to the vectors."""
+        """Return the matrix with one more row, for a point appended to the vectors."""
         shifted = point - self.origin
         row = np.array([(vector - self.origin) @ shifted for vector in vectors])
         corner = np.array([[shifted @ shifted]])
@@ -84,12 +88,20 @@ class Gram:
 class LLE:
     """A base of shapes with the weights of each in terms of the others.
 
-    vectors : n arrays of shape (D,)
-    gram : their inner products
-    same_as : ndarray of int, shape (n,), number of the first member equal to each, mostly its own
-    neighbors : ndarray of int, shape (n, k), nearest first; never the member itself or its equals
-    weights : ndarray, shape (n, k); a repeated member has weight 1 on the first one equal to it
-    n_neighbors, regularization, convex : as requested; see `barycenter`
+    Attributes
+    ----------
+    vectors : tuple[ndarray, ...]
+        n arrays of shape (D,).
+    gram : Gram
+        Their inner products.
+    same_as : ndarray of int, shape (n,)
+        Number of the first member equal to each, mostly its own.
+    neighbors : ndarray of int, shape (n, k)
+        Nearest first; never the member itself or its equals.
+    weights : ndarray
+        Shape (n, k); a repeated member has weight 1 on the first one equal to it.
+    n_neighbors, regularization, convex : int
+        As requested; see `barycenter`.
     """
 
     vectors: tuple[FloatArray, ...]
@@ -145,15 +157,22 @@ def fit(
     convex: bool = False,
     gram: Gram | None = None,
 ) -> LLE:
-    """Weights of every member of a base in terms of its neighbours (Eq. 15).
-
-    vectors : n arrays of shape (D,), not copied; an array of shape (n, D) will do
-    n_neighbors : k, neighbours of each member
-    regularization : part of the trace added to the diagonal of each local Gram matrix
-    convex : non-negative weights; regularization is then not used
-    gram : their inner products, if known
+    """Return the weights of every member of a base in terms of its neighbours (Eq. 15).
 
     Raises LLEError if the base is empty, k <= 0, a value is not finite or lengths differ.
+
+    Parameters
+    ----------
+    vectors : Sequence[array_like] or ndarray
+        n arrays of shape (D,), not copied; an array of shape (n, D) will do.
+    n_neighbors : int
+        k, neighbours of each member.
+    regularization : float
+        Part of the trace added to the diagonal of each local Gram matrix.
+    convex : bool
+        Non-negative weights; regularization is then not used.
+    gram : Gram or None
+        Their inner products, if known.
     """
     rows = tuple(np.asarray(v, dtype=np.float64) for v in vectors)
     if not rows:
@@ -181,7 +200,7 @@ def fit(
 
 
 def _first_equal(gram: Gram, i: int, same_as: IntArray) -> int:
-    """Number of the first member equal to member i; i if there is none before it.
+    """Return the number of the first member equal to member i; i if there is none before it.
 
     same_as : ndarray of int, shape (i,), of the members before it
     """
@@ -194,7 +213,7 @@ def _first_equal(gram: Gram, i: int, same_as: IntArray) -> int:
 
 
 def _with_weights(base: LLE) -> LLE:
-    """The base with the neighbours and weights of every member."""
+    """Return the base with the neighbours and weights of every member."""
     n = len(base)
     is_first = base.same_as == np.arange(n)
     first, again = np.flatnonzero(is_first), np.flatnonzero(~is_first)
@@ -210,7 +229,7 @@ def _with_weights(base: LLE) -> LLE:
 
 
 def _nearest(base: LLE, rows: IntArray, k: int) -> IntArray:
-    """The k nearest others, repeated members left out; ties go to the lower number."""
+    """Return the k nearest others, repeated members left out; ties go to the lower number."""
     squared = base.gram.squared_distances(rows)
     squared[:, list(base.repeated)] = np.inf
     squared[np.arange(len(rows)), rows] = np.inf
@@ -218,7 +237,7 @@ def _nearest(base: LLE, rows: IntArray, k: int) -> IntArray:
 
 
 def _row_weights(base: LLE, rows: IntArray, neighbors: IntArray) -> FloatArray:
-    """Weights of members from the Gram matrix, or from differences where it loses digits."""
+    """Return weights of members from the Gram matrix, or from differences where it loses digits."""
     products, lengths = base.gram.products, base.gram.squared_lengths
     cross = products[rows[:, None], neighbors]
     local = products[neighbors[:, :, None], neighbors[:, None, :]]
@@ -249,15 +268,19 @@ def _imprecise(local: FloatArray, lengths: FloatArray, base: LLE) -> IntArray:
 class Embedding:
     """Low-dimensional coordinates of a base.
 
-    coordinates : ndarray Y, shape (n, d), zero mean, Y^T Y = n I
-    eigenvalues : ndarray, shape (d,), the lowest of M, ascending, without that of the constant
+    Attributes
+    ----------
+    coordinates : ndarray
+        Y, shape (n, d), zero mean, Y^T Y = n I.
+    eigenvalues : ndarray, shape (d,)
+        The lowest of M, ascending, without that of the constant.
     """
 
     coordinates: FloatArray
     eigenvalues: FloatArray
 
     def of(self, point: Barycenter) -> FloatArray:
-        """Coordinates of a point that is not in the base, sum_j w_j Y_j, shape (d,)."""
+        """Return the coordinates of a point that is not in the base, sum_j w_j Y_j, shape (d,)."""
         return point.weights @ self.coordinates[point.neighbors]
 
 
@@ -265,11 +288,18 @@ class Embedding:
 class Dimension:
     """Estimates of how many parameters the shapes of a base depend on.
 
-    from_gap : number of eigenvalues of M below its largest spectral gap
-    gap : ratio of the two eigenvalues at the gap; near 1 the spectrum shows no dimension
-    from_local_pca : principal components for 99 % of the variance of a neighbourhood, median
-    eigenvalues : ndarray, the lowest of M, ascending
-    local_variances : ndarray, shape (k - 1,), mean fraction of the variance, descending
+    Attributes
+    ----------
+    from_gap : int
+        Number of eigenvalues of M below its largest spectral gap.
+    gap : float
+        Ratio of the two eigenvalues at the gap; near 1 the spectrum shows no dimension.
+    from_local_pca : int
+        Principal components for 99 % of the variance of a neighbourhood, median.
+    eigenvalues : ndarray
+        The lowest of M, ascending.
+    local_variances : ndarray, shape (k - 1,)
+        Mean fraction of the variance, descending.
     """
 
     from_gap: int
@@ -322,7 +352,7 @@ def spectrum(base: LLE, n_values: int) -> tuple[FloatArray, FloatArray]:
 
 
 def embed(base: LLE, n_components: int) -> Embedding:
-    """Coordinates that the weights reconstruct best (Eq. 16): min |Y - W Y|^2, Y^T Y = n I.
+    """Return coordinates that the weights reconstruct best (Eq. 16): min |Y - W Y|^2, Y^T Y = n I.
 
     Raises LLEError unless there are more different anatomies than components.
     """
@@ -331,7 +361,7 @@ def embed(base: LLE, n_components: int) -> Embedding:
 
 
 def estimate_dimension(base: LLE, n_values: int = 20) -> Dimension:
-    """Dimension from the gap in the spectrum of M (Polito & Perona 2001) and from local PCA.
+    """Return dimension from the gap in the spectrum of M (Polito & Perona 2001) and from local PCA.
 
     Neither can exceed the number of neighbours minus one. ``notices`` say if
     they should not be trusted.
@@ -362,7 +392,7 @@ def estimate_dimension(base: LLE, n_values: int = 20) -> Dimension:
 
 
 def local_variances(base: LLE) -> FloatArray:
-    """Fractions of the variance along the principal axes of each neighbourhood, descending.
+    """Return fractions of the variance along the principal axes of each neighbourhood, descending.
 
     Returns ndarray, shape (members that differ, k - 1).
     """

@@ -34,9 +34,13 @@ PLAUSIBLE_SCALE = (0.5, 2.0)  # of livers against the template, measured 0.82 to
 class Template:
     """The liver to which all others are registered.
 
-    name : of the organ it was made from
+    Attributes
+    ----------
+    name : str
+        Name of the organ it was made from.
     mesh : TetMesh
-    regions : Regions, clamp and accessible faces over ``mesh.boundary_faces``
+    regions : Regions
+        Clamp and accessible faces over ``mesh.boundary_faces``.
     """
 
     name: str
@@ -48,23 +52,38 @@ class Template:
 class RegistrationRule:
     """Stiffnesses, number of steps and tolerances of a registration.
 
-    first_stiffness, last_stiffness : of the distortion against the distances, both made
-        dimensionless with the cube root of the target's volume
-    n_stages, sweeps : the stiffness falls by equal factors in ``n_stages`` of ``sweeps`` steps
-    last_sweeps : of steps that follow in the last stage, until the tolerance and the reach are met
-    tolerance : mean node-to-surface distance at which the registration has converged [m]
-    reach : distance from a target sample beyond which the template is pulled straight to it [m]
-    largest_mean, largest_reverse_mean : mean distance beyond which a registration has failed, from
-        the template's vertices to the target and from the target to the template's faces [m]
-    least_jacobian : volume of a tetrahedron over its aligned one below which it has failed
-    largest_distortion : W above which the target is not of the template's kind; 64 livers measure
-        0.21 to 0.85, a torus 2.4
-    n_samples : springs from the target; three times as many samples are searched for the nearest
-    normal_length : distance that a normal turned by one radian counts as [m]
-    tangential : stiffness of springs along the surface over that across it in the first stage;
-        falls to 0
-    exact_stiffness : below it, the nearest point is sought on the target's triangles
-    rotation_spread : standard deviation of the rotation between patients lying alike [deg]
+    Attributes
+    ----------
+    first_stiffness, last_stiffness : float
+        First stiffness and last stiffness of the distortion against the distances, both made
+        dimensionless with the cube root of the target's volume.
+    n_stages, sweeps : int
+        The stiffness falls by equal factors in ``n_stages`` of ``sweeps`` steps.
+    last_sweeps : int
+        Last sweeps of steps that follow in the last stage, until the tolerance and the reach are
+        met.
+    tolerance : float
+        Mean node-to-surface distance at which the registration has converged [m].
+    reach : float
+        Distance from a target sample beyond which the template is pulled straight to it [m].
+    largest_mean, largest_reverse_mean : float
+        Mean distance beyond which a registration has failed, from the template's vertices to the
+        target and from the target to the template's faces [m].
+    least_jacobian : float
+        Volume of a tetrahedron over its aligned one below which it has failed.
+    largest_distortion : float
+        W above which the target is not of the template's kind; 64 livers measure 0.21 to 0.85, a
+        torus 2.4.
+    n_samples : int
+        Springs from the target; three times as many samples are searched for the nearest.
+    normal_length : float
+        Distance that a normal turned by one radian counts as [m].
+    tangential : float
+        Stiffness of springs along the surface over that across it in the first stage; falls to 0.
+    exact_stiffness : float
+        Below it, the nearest point is sought on the target's triangles.
+    rotation_spread : float
+        Standard deviation of the rotation between patients lying alike [deg].
     """
 
     first_stiffness: float = 1.0
@@ -96,11 +115,18 @@ class RegistrationRule:
 class RegistrationStep:
     """One step of the continuation.
 
-    stiffness : of the stage
-    objective : after the step, with the springs of the step
-    length : fraction of the Newton step taken; 0 if no step lowered the objective
-    mean_distance : of the surface vertices to the target [m]
-    least_jacobian : smallest volume of a tetrahedron over its aligned one
+    Attributes
+    ----------
+    stiffness : float
+        Stiffness of the stage.
+    objective : float
+        After the step, with the springs of the step.
+    length : float
+        Fraction of the Newton step taken; 0 if no step lowered the objective.
+    mean_distance : float
+        Mean distance of the surface vertices to the target [m].
+    least_jacobian : float
+        Smallest volume of a tetrahedron over its aligned one.
     """
 
     stiffness: float
@@ -136,11 +162,18 @@ class SimilarityTransform:
 class RegistrationQuality:
     """Distances of a registered template from its target, and the state of its tetrahedra.
 
-    mean_distance, max_distance : surface vertices to the target [m]
-    reverse_mean_distance, reverse_max_distance : target samples to the registered faces [m]
-    least_jacobian : smallest volume of a tetrahedron over its aligned one
-    distortion : W, 0 for a similarity
-    shape : MeshQuality of the registered mesh
+    Attributes
+    ----------
+    mean_distance, max_distance : float
+        Surface vertices to the target [m].
+    reverse_mean_distance, reverse_max_distance : float
+        Target samples to the registered faces [m].
+    least_jacobian : float
+        Smallest volume of a tetrahedron over its aligned one.
+    distortion : float
+        W, 0 for a similarity.
+    shape : MeshQuality
+        MeshQuality of the registered mesh.
     """
 
     mean_distance: float
@@ -156,13 +189,19 @@ class RegistrationQuality:
 class Registration:
     """A template registered to a target.
 
+    Attributes
+    ----------
     template : Template
-    mesh : TetMesh, the template's tetrahedra with moved vertices
-    alignment : SimilarityTransform from which the elastic registration started
+    mesh : TetMesh
+        The template's tetrahedra with moved vertices.
+    alignment : SimilarityTransform
+        SimilarityTransform from which the elastic registration started.
     quality : RegistrationQuality
-    history : one entry per step
-    converged : whether the alignment converged and the tolerance was met; if not, the last stage
-        was still within the larger distances of the rule
+    history : tuple[RegistrationStep, ...]
+        One entry per step.
+    converged : bool
+        Whether the alignment converged and the tolerance was met; if not, the last stage was still
+        within the larger distances of the rule.
     """
 
     template: Template
@@ -179,7 +218,7 @@ class Registration:
 
 
 def not_converged(quality: RegistrationQuality) -> str:
-    """Notice of a registration that is used although it did not converge."""
+    """Return the notice of a registration that is used although it did not converge."""
     return (
         f"registration not converged: {quality.mean_distance * 1e3:.2g} mm from the surface in the "
         "mean; check the regions, or register from a liver more like it"
@@ -270,7 +309,7 @@ class _Fit:
         return x, RegistrationStep(stiffness, value, length, float(distance.mean()), jacobian)
 
     def missed(self, x: FloatArray) -> float:
-        """Largest distance of a target sample from the template [m]."""
+        """Return the largest distance of a target sample from the template [m]."""
         return float(self.target.distance_to(x, self.mesh.boundary_faces).max())
 
     @cached_property
@@ -304,7 +343,7 @@ def line_search(
 def measure(
     distortion: Distortion, mesh: TetMesh, positions: FloatArray, target: Target
 ) -> RegistrationQuality:
-    """Distances in both directions, and the state of the tetrahedra."""
+    """Return the distances in both directions, and the state of the tetrahedra."""
     distance, _ = target.closest(positions[mesh.surface_vertices])
     reverse = target.distance_to(positions, mesh.boundary_faces)
     return RegistrationQuality(

@@ -29,10 +29,15 @@ _PIECES = 3  # a template face is sampled at the centroids of this number square
 class Target:
     """A surface with evenly distributed samples.
 
+    Attributes
+    ----------
     surface : SurfaceMesh
-    points, normals : ndarray, shape (n, 3) [m]; normals point outward, by the winding number
-    volume : enclosed volume [m^3]
-    center : its centroid, shape (3,) [m]
+    points, normals : ndarray, shape (n, 3)
+        Points and normals [m]; normals point outward, by the winding number.
+    volume : float
+        Enclosed volume [m^3].
+    center : ndarray, shape (3,)
+        Its centroid [m].
     """
 
     surface: SurfaceMesh
@@ -42,14 +47,14 @@ class Target:
     center: FloatArray
 
     def closest(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Distances to the surface and closest points of it, shapes (k,) and (k, 3) [m]."""
+        """Return distances to the surface and closest points of it, shapes (k,) and (k, 3) [m]."""
         squared, _, nearest = igl.point_mesh_squared_distance(
             np.ascontiguousarray(points), self.surface.vertices, self.surface.faces.astype(np.int64)
         )
         return np.sqrt(squared), nearest
 
     def distance_to(self, vertices: FloatArray, faces: IntArray) -> FloatArray:
-        """Distances of the samples from another triangulation, shape (n,) [m]."""
+        """Return the distances of the samples from another triangulation, shape (n,) [m]."""
         squared, _, _ = igl.point_mesh_squared_distance(
             self.points, vertices, faces.astype(np.int64)
         )
@@ -92,7 +97,7 @@ def sample_target(surface: SurfaceMesh, n: int) -> Target:
 def _facing(
     surface: SurfaceMesh, points: FloatArray, normals: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Outward normals of samples, and which samples separate inside from outside.
+    """Return the outward normals of samples, and which samples separate inside from outside.
 
     At a face, the winding number jumps according to the orientation of that face; half an edge
     away, its neighbours outweigh a flipped face.
@@ -111,9 +116,14 @@ def _facing(
 class Springs:
     """Pairs of a point on the template, sum_k barycentric_k x_node_k, and its anchor on the target.
 
-    nodes : ndarray of int, shape (m, 3); barycentric : shape (m, 3)
-    anchors, normals : shape (m, 3) [m]
-    weights : stiffness of each spring, shape (m,); those from each surface sum to one
+    Attributes
+    ----------
+    nodes : ndarray of int, shape (m, 3)
+    barycentric : ndarray, shape (m, 3)
+    anchors, normals : ndarray, shape (m, 3)
+        Anchors and normals [m].
+    weights : ndarray, shape (m,)
+        Stiffness of each spring ; those from each surface sum to one.
     """
 
     nodes: IntArray
@@ -123,11 +133,11 @@ class Springs:
     weights: FloatArray
 
     def points(self, positions: FloatArray) -> FloatArray:
-        """Ends of the springs on the template, shape (m, 3) [m]."""
+        """Return the ends of the springs on the template, shape (m, 3) [m]."""
         return np.einsum("ik,ikd->id", self.barycentric, positions[self.nodes])
 
     def straightened(self, positions: FloatArray, reach: float) -> Springs:
-        """The same, but those longer than ``reach`` [m] pull along their gap."""
+        """Return the same, but those longer than ``reach`` [m] pull along their gap."""
         gap = self.anchors - self.points(positions)
         length = np.linalg.norm(gap, axis=1)
         far = length > reach
@@ -188,7 +198,7 @@ def surface_springs(
 
 
 def _on_triangles(points: FloatArray, target: Target) -> tuple[FloatArray, FloatArray]:
-    """Closest points of the target and gradients of the distance there, each (n, 3)."""
+    """Return the closest points of the target and gradients of the distance there, each (n, 3)."""
     distance, anchor = target.closest(points)
     near = cKDTree(target.points).query(anchor)[1]
     gradient = _unit(points - anchor)  # dominated by rounding where the distance is small
@@ -198,19 +208,19 @@ def _on_triangles(points: FloatArray, target: Target) -> tuple[FloatArray, Float
 def _nearest(
     among: tuple[FloatArray, FloatArray], of: tuple[FloatArray, FloatArray], length: float
 ) -> IntArray:
-    """Indices of the nearest pairs of position and normal, shape (k,)."""
+    """Return the indices of the nearest pairs of position and normal, shape (k,)."""
     tree = cKDTree(np.hstack([among[0], length * among[1]]))
     return tree.query(np.hstack([of[0], length * of[1]]))[1]
 
 
 def _area_normals(vertices: FloatArray, faces: NDArray[np.integer]) -> FloatArray:
-    """Normal of each face times its area, shape (m, 3) [m^2]."""
+    """Return the normal of each face times its area, shape (m, 3) [m^2]."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return 0.5 * np.cross(b - a, c - a)
 
 
 def _vertex_normals(face_normals: FloatArray, faces: IntArray, n_vertices: int) -> FloatArray:
-    """Area-weighted unit normals, zero off the surface, shape (n_vertices, 3)."""
+    """Return the area-weighted unit normals, zero off the surface, shape (n_vertices, 3)."""
     weight = np.repeat(face_normals, 3, axis=0)
     sums = [np.bincount(faces.ravel(), weight[:, axis], n_vertices) for axis in range(3)]
     return _unit(np.stack(sums, axis=1))

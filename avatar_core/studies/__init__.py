@@ -33,7 +33,7 @@ NAMES = (
 
 
 def load_study(name: str) -> Study[Any]:
-    """The study of that name, one of :data:`NAMES`."""
+    """Return the study of that name, one of :data:`NAMES`."""
     module = import_module(f"{__name__}.{name.replace('-', '_')}")
     study: Study[Any] = module.STUDY
     return study

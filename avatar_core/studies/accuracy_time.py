@@ -52,7 +52,8 @@ FRESH = 1001  # seed of loads that no certificate draws
 @dataclass(frozen=True)
 class AccuracyTimeSettings:
     """Numbers of vertices, of touches: certified, fresh and of the rivals; sizes of the meshes;
-    other livers on which budgets are tried, with so many touches each."""
+    other livers on which budgets are tried, with so many touches each.
+    """
 
     n_vertices: int = 2850
     n_certified: int = 200
@@ -136,7 +137,7 @@ STUDY = AccuracyTimeStudy()
 
 
 def short_table(rows: list[Row]) -> tuple[str, ...]:
-    """Fastest steps within some errors, and rivals; all vertices shown."""
+    """Return the fastest steps within some errors, and rivals; all vertices shown."""
     volume = [row for row in rows if row.get("cloud") == "volume"]
     lines = ["| 95 % of loads within | step p50 / p99 [us] | by | MB |", "|---|---|---|---|"]
     for error in (0.01, 0.015, 0.02, 0.05, 0.10, 0.20, 0.40):
@@ -158,12 +159,12 @@ def _line(error: str, row: dict[str, Any], by: str) -> str:
 
 
 def _least_kept(rows: list[Row]) -> float:
-    """The least part of touches that keep a budget, over livers and budgets."""
+    """Return the least part of touches that keep a budget, over livers and budgets."""
     return min((float(row["kept"]) for row in rows if "kept" in row), default=float("nan"))  # type: ignore[arg-type]
 
 
 def _best(rows: list[Row]) -> dict[str, Any]:
-    """All modes, all vertices."""
+    """Return all modes, all vertices."""
     found = [r for r in _of(rows, "vademecum") if r.get("cloud") == "volume"]
     return min(found, key=lambda r: r["error"])
 
@@ -220,14 +221,15 @@ def _online(rows: list[Row], cloud: str, axes: Axes) -> None:
 
 
 def _said(vademecum: Vademecum, fresh: StepErrors) -> np.ndarray:
-    """The relative error that is said with the force of each touch."""
+    """Return the relative error that is said with the force of each touch."""
     assert vademecum.certificate is not None
     return vademecum.certificate.force_error.relative(fresh.smoothing)
 
 
 def _force_figures(error: np.ndarray, said: np.ndarray) -> dict[str, float]:
     """How many errors are covered by what is said, and by how much more that is in the median;
-    beside one error for all touches that covers as many."""
+    beside one error for all touches that covers as many.
+    """
     covered = float(np.mean(error <= said))
     return {
         "force_error_coverage": covered,

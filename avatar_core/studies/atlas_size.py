@@ -94,7 +94,7 @@ class AtlasSizeStudy(Study[AtlasSizeSettings]):
         run.notices += _on_paper(run.rows)
 
     def summary(self, run: Run[AtlasSizeSettings]) -> dict[str, float]:
-        """Figures of each number of anatomies."""
+        """Return the figures of each number of anatomies."""
         keys = [key for key in run.rows[0] if key != "n"]
         return {f"{key}_{row['n']}": float(row[key] or 0.0) for row in run.rows for key in keys}
 
@@ -169,7 +169,7 @@ def _in_own_process(function: Callable[..., Row], *arguments: object) -> Row:
 
 
 def _patient(folder: Path, vertices: np.ndarray) -> Row:
-    """CPU seconds of a patient by stage, and the largest memory of the process [MB]."""
+    """Return CPU seconds of a patient by stage, and the largest memory of the process [MB]."""
     start = cpu_seconds()
     atlas = load_atlas(folder)
     base = base_of(atlas)
@@ -189,7 +189,7 @@ def _patient(folder: Path, vertices: np.ndarray) -> Row:
 
 
 def _addition(folder: Path, newcomer: SurfaceMesh) -> Row:
-    """CPU seconds to add a surface, with its rough registration and without a response."""
+    """Return CPU seconds to add a surface, with its rough registration and without a response."""
     start = cpu_seconds()
     extend_atlas(folder, [newcomer], workers=Workers(1))
     return {"add_seconds": cpu_seconds() - start}

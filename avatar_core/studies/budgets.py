@@ -41,7 +41,7 @@ def budget_rows(vademecum: Vademecum, fresh: StepErrors) -> list[Row]:
 
 
 def budget_table(rows: Sequence[Row]) -> tuple[str, ...]:
-    """One line for each liver and tolerance."""
+    """Return one line for each liver and tolerance."""
     lines = ["| liver | budget | chosen | touches that keep it |", "|---|---|---|---|"]
     for row in rows:
         kept = f"{row['kept']:.1%} of {row['size']}" if "kept" in row else "-"

@@ -49,7 +49,8 @@ _N_VERTICES = 700
 
 def bands_section(surface: SurfaceMesh, settings: CertaintySettings, bar: ProgressBar) -> Section:
     """Bands of a small organ, whatever the liver of the study: a thousand of its problems are
-    solved."""
+    solved.
+    """
     vademecum, problem = _small_organ(settings, bar)
     known, places = known_of(vademecum, KNOWN), starts_apart(vademecum, settings.n_places)
     start = process_time()
@@ -89,7 +90,7 @@ _BANDS = (
 
 
 def band_errors(rows: Sequence[Row]) -> tuple[float, float]:
-    """Worst relative error of the edges of all bands, and of their ratios to the medians.
+    """Return worst relative error of the edges of all bands, and of their ratios to the medians.
 
     The first holds the error of the force itself at a place, which `avatar show` tells: at a thin
     edge it is large, as the felt surface is smoothed there. The second is that of the band alone.
@@ -118,7 +119,7 @@ def _small_organ(settings: CertaintySettings, bar: ProgressBar) -> tuple[Vademec
 def _full_forces(
     vademecum: Vademecum, problem: Elasticity, places: list[int], draws: dict[str, FloatArray]
 ) -> FloatArray:
-    """Forces by a solution of each draw, shape (n, n_places) [N]."""
+    """Return the forces by a solution of each draw, shape (n, n_places) [N]."""
     surface, n = vademecum.surface, len(draws["young"])
     loads = patch_loads(problem, surface.centers[places], surface.patch_radius)
     normals, force = surface.normals[places], np.empty((n, len(places)))

@@ -153,7 +153,7 @@ def _nearness(vademecum: Vademecum, tumour: SurfaceMesh, among: IntArray) -> Flo
 
 
 def _well_known(vademecum: Vademecum) -> IntArray:
-    """Inner positions at which the vademecum says itself that its force is right."""
+    """Return the inner positions at which the vademecum says itself that its force is right."""
     inner = inner_positions(vademecum)
     error = force_error_at(vademecum, vademecum.surface.centers[inner])
     kept: IntArray = inner[error < WELL_KNOWN]

@@ -54,7 +54,7 @@ class _Held(Organ):
 def supports_section(
     surface: SurfaceMesh, settings: CertaintySettings, bar: ProgressBar
 ) -> Section:
-    """The vademecum over k, and the limits of full finite elements."""
+    """Return the vademecum over k, and the limits of full finite elements."""
     held = _held(surface, settings)
     start = time.process_time()
     rule = BuildRule(max_modes=settings.max_modes)

@@ -51,7 +51,8 @@ LIVERS = ("LiTS-20", "LiTS-50", "Amos-052", "Amos-086")  # not those of the cali
 @dataclass(frozen=True)
 class ContactSettings:
     """Size of the study: livers by name, places and edges on each, tips and depths [m]; places
-    where a ball is pressed on each of some ``invariant`` livers that are given in other ways."""
+    where a ball is pressed on each of some ``invariant`` livers that are given in other ways.
+    """
 
     livers: tuple[str, ...] = LIVERS
     n_places: int = 6
@@ -130,7 +131,7 @@ STUDY = ContactStudy()
 def contacts_of(
     surface: SurfaceMesh, settings: ContactSettings, notices: list[str]
 ) -> list[SiteContact]:
-    """All contacts on one liver; what could not be resolved is counted in a notice."""
+    """Return all contacts on one liver; what could not be resolved is counted in a notice."""
     vademecum = build(surface, settings.options)
     places = draw_sites(vademecum, surface, settings.n_places, seed=7)
     places += edge_sites(vademecum, surface, settings.n_edges, seed=7)
@@ -141,7 +142,7 @@ def contacts_of(
 
 
 def reference_error() -> float:
-    """Worst relative error of the reference for a sphere of 3 mm, 1 and 2 mm deep in a cube.
+    """Return worst relative error of the reference for a sphere of 3 mm, 1 and 2 mm deep in a cube.
 
     Against Sneddon's half-space; the cube of 200 mm is clamped at its bottom.
     """
@@ -158,14 +159,14 @@ def reference_error() -> float:
 
 
 def sneddon(tip: Tip, material: Material, depth: float) -> float:
-    """Force on a sphere in a half-space (Sneddon 1965) [N]."""
+    """Return the force on a sphere in a half-space (Sneddon 1965) [N]."""
     a, r = half_space_radius(tip, depth), tip.radius
     stiffness = material.plane_strain_modulus
     return float(stiffness * (0.5 * (a * a + r * r) * np.log((r + a) / (r - a)) - a * r))
 
 
 def summary_of(contacts: Sequence[SiteContact]) -> dict[str, float]:
-    """Key figures; errors are relative, of the force along that of the resolved contact."""
+    """Return key figures; errors are relative, of the force along that of the resolved contact."""
     found = summarized(contacts)
     patch = np.array([abs(contact.patch / contact.truth - 1.0) for contact in contacts])
     hertz = np.array([abs(contact.hertz / contact.truth - 1.0) for contact in contacts])
@@ -191,7 +192,7 @@ def summary_of(contacts: Sequence[SiteContact]) -> dict[str, float]:
 
 
 def _groups(contacts: Sequence[SiteContact]) -> dict[str, list[SiteContact]]:
-    """Spheres by the kind of their place, and other tips by their shape; none is empty."""
+    """Return spheres by the kind of their place, and other tips by their shape; none is empty."""
     spheres = [contact for contact in contacts if contact.tip.shape == "sphere"]
     groups = {kind: [c for c in spheres if c.site.kind == kind] for kind in KINDS}
     groups |= {s: [c for c in contacts if c.tip.shape == s] for s in ("cone", "flat")}

@@ -83,7 +83,7 @@ class CoordinatesStudy(Study[CoordinatesSettings]):
             run.rows += _large(large, "st-venant-kirchhoff", settings, progress)
 
     def summary(self, run: Run[CoordinatesSettings]) -> dict[str, float]:
-        """Worst of both livers where there are two."""
+        """Return the worst of both livers where there are two."""
         summary: dict[str, float] = {}
         for name in ("poisson", "incompressible", "tumour"):
             best = where(run.rows, coordinate=name, modes=RANKS[-1])
@@ -170,7 +170,7 @@ def _parametric(
     settings: CoordinatesSettings,
     progress: Progress,
 ) -> list[Row]:
-    """Errors of the default against modes, and the time of its build."""
+    """Return the errors of the default against modes, and the time of its build."""
     start = time.process_time()
     vademecum = organ.parametric(coordinates, BuildRule(), progress)
     seconds = time.process_time() - start
@@ -197,7 +197,7 @@ def _parametric(
 
 
 def _with_modes(vademecum: Vademecum, modes: int) -> Vademecum:
-    """The vademecum with so many modes at a place, at any value of its coordinates."""
+    """Return the vademecum with so many modes at a place, at any value of its coordinates."""
     parametric = vademecum.parametric
     assert parametric is not None
     most = modes - parametric.n_global
@@ -210,7 +210,7 @@ def _with_modes(vademecum: Vademecum, modes: int) -> Vademecum:
 
 
 def _tumour_rows(settings: CoordinatesSettings, progress: Progress) -> list[Row]:
-    """Poisson's ratio and the contrast of real tumours together."""
+    """Return Poisson's ratio and the contrast of real tumours together."""
     liver, tumour = TUMOUR_FOLDER / "liver.vtk", TUMOUR_FOLDER / "liver_tumours.vtk"
     if not liver.is_file():
         return []
@@ -226,7 +226,7 @@ def _tumour_rows(settings: CoordinatesSettings, progress: Progress) -> list[Row]
 def _large(
     organ: Organ, material: LargeMaterial, settings: CoordinatesSettings, progress: Progress
 ) -> list[Row]:
-    """One material: its summary, every push, and combinations of neo-Hookean ones."""
+    """Return one material: its summary, every push, and combinations of neo-Hookean ones."""
     start = time.process_time()
     linear = organ.linear(BuildRule(), progress)
     problem = hyperelastic_problem(linear, material)
@@ -260,7 +260,7 @@ def _large(
 
 
 def _pace(linear: Vademecum, bent: Vademecum) -> float:
-    """Time of a step with large deformation over that without, all modes; medians."""
+    """Return the time of a step with large deformation over that without, all modes; medians."""
     times = [time_steps(one, 1).p50_us for one in (linear, bent)]
     return times[1] / times[0]
 

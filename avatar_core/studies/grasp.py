@@ -127,7 +127,7 @@ STUDY = GraspStudy()
 
 
 def pulls_at(vademecum: Vademecum, organ: SurfaceMesh, site: Site, radius: float) -> Iterator[Row]:
-    """A row for each angle, of one jaw at one place."""
+    """Yield a row for each angle, of one jaw at one place."""
     normal = site.normal / np.linalg.norm(site.normal)
     flat = Tip("flat", radius)
     resolved = refined_organ(
@@ -170,7 +170,7 @@ def pulls_at(vademecum: Vademecum, organ: SurfaceMesh, site: Site, radius: float
 def held_at(
     vademecum: Vademecum, place: FloatArray, normal: FloatArray, radius: float
 ) -> tuple[ContactData, FloatArray]:
-    """A tool whose jaw has just closed at a place, and where it is [m]."""
+    """Return a tool whose jaw has just closed at a place, and where it is [m]."""
     tip = Tip("sphere", TIP_RADIUS, grasp=Jaw(radius, 100.0))
     data = model_of(vademecum, (tip,), cloud="volume").data()
     start = place + normal * (TIP_RADIUS + _ABOVE)
@@ -182,7 +182,7 @@ def held_at(
 def _rivals(
     vademecum: Vademecum, data: ContactData, disc: BondedDisc, pull: FloatArray, radius: float
 ) -> Row:
-    """Errors of the force by the patch alone, and by the disc on a half-space."""
+    """Return the errors of the force by the patch alone, and by the disc on a half-space."""
     state, truth = data.state, disc.stiffness @ pull
     nodes, weights = state.nodes[0, : state.n_nodes[0]], state.weight[0, : state.n_nodes[0], 0]
     patch = np.linalg.solve(vademecum.compliance(nodes, weights), pull)

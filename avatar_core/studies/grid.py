@@ -100,7 +100,7 @@ class GridStudy(Study[GridSettings]):
         ]
 
     def summary(self, run: Run[GridSettings]) -> dict[str, float]:
-        """Mean and worst of each error over the livers, for each spacing; the order."""
+        """Return the mean and worst of each error over the livers, for each spacing; the order."""
         rows, spacings = run.rows, run.settings.spacings
         summary: dict[str, float] = {}
         for h in spacings:
@@ -159,7 +159,7 @@ STUDY = GridStudy()
 def grid_row(
     surface: SurfaceMesh, h: float, reference: Reference | None, settings: GridSettings
 ) -> Row:
-    """Errors of one liver at one spacing; displacements only with a reference."""
+    """Return the errors of one liver at one spacing; displacements only with a reference."""
     grid = distance_grid(surface, h, padding=BAND * h, band=BAND * h)
     marched = isosurface(grid)
     row: Row = {
@@ -179,7 +179,7 @@ def grid_row(
 
 
 def other_mesh_row(surface: SurfaceMesh, reference: Reference, settings: GridSettings) -> Row:
-    """Change of the displacement with another mesh of the same surface."""
+    """Return the change of the displacement with another mesh of the same surface."""
     found = remeshed_errors(surface, reference, round(OTHER_MESH * settings.n_vertices))
     return {
         "liver": surface.name,
@@ -223,7 +223,7 @@ def remeshed_errors(surface: SurfaceMesh, reference: Reference, n_vertices: int)
 def distance_error(
     surface: SurfaceMesh, origin: FloatArray, h: float, settings: GridSettings
 ) -> float:
-    """|phi_h - phi| / |phi| in L2 over the organ, at random points of it."""
+    """Return |phi_h - phi| / |phi| in L2 over the organ, at random points of it."""
     low, high = surface.bounding_box
     points = np.random.default_rng(settings.seed).uniform(low, high, (settings.n_points, 3))
     exact = surface.skin.signed_distance(points)

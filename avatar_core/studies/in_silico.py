@@ -188,7 +188,7 @@ def spectrum_row(vectors: FloatArray, k: int, regularization: float) -> Row:
 
 
 def held_out_rows(livers: Population, settings: InSilicoSettings) -> list[Row]:
-    """Errors of each held-out liver, interpolated among the base."""
+    """Return the errors of each held-out liver, interpolated among the base."""
     base = fit(livers.vectors[: settings.n_base], NEIGHBORS)
     everyone = fit(livers.vectors[: settings.n_base], settings.n_base - 1)
     held_out = range(settings.n_base, settings.n_base + settings.n_held_out)

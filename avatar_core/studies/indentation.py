@@ -139,20 +139,20 @@ def small_strain_depth(load: float) -> float:
 
 
 def law_depth(load: float, law: np.ndarray) -> float:
-    """The same at large strain, by c_0 ... c_3 of the law; within the range of its fit."""
+    """Return the same at large strain, by c_0 ... c_3 of the law; within the range of its fit."""
     s = np.cbrt(0.75 * load)
     return small_strain_depth(load) + float(s**3 * (law[:4] @ s ** np.arange(4)))
 
 
 def law_force(depth: float, nu: float, table: np.ndarray = COEFFICIENTS) -> float:
-    """F / (E R^2) at a depth [R] by the law."""
+    """Return F / (E R^2) at a depth [R] by the law."""
     law = interpolated(table, nu)
     load = brentq(lambda load: law_depth(load, law) - depth, 1e-9, 1.4 * law[4])
     return float(load / (1.0 - nu**2))
 
 
 def fit(rows: Sequence[Row]) -> np.ndarray:
-    """A table like ``COEFFICIENTS``, by least squares of the relative depth at each nu."""
+    """Return a table like ``COEFFICIENTS``, by least squares of the relative depth at each nu."""
     curve = where(rows, kind="curve")
     found = []
     for ratio in sorted(set(column(curve, "nu").tolist())):
@@ -184,13 +184,13 @@ def _rows(kind: str, nu: float, found: Sequence[Indentation]) -> list[Row]:
 
 
 def _sneddon(nu: float, depth: float) -> float:
-    """F / (E R^2) at small strain."""
+    """Return F / (E R^2) at small strain."""
     radius = _TIP.radius
     return sneddon(_TIP, Material(1.0, nu), depth * radius) / radius**2
 
 
 def _misses(curve: list[Row], table: np.ndarray) -> float:
-    """Worst error of the law's force, relative."""
+    """Return the worst error of the law's force, relative."""
     nu, depth, force = (column(curve, key) for key in ("nu", "depth", "force"))
     found = [law_force(d, ratio, table) for d, ratio in zip(depth, nu, strict=True)]
     return float(np.abs(np.array(found) / force - 1.0).max())

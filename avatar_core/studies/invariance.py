@@ -38,7 +38,7 @@ class Differences:
     said: np.ndarray
 
     def figures(self, name: str) -> dict[str, float]:
-        """Quantiles, and the part of the places that the errors said cover."""
+        """Return the quantiles, and the part of the places that the errors said cover."""
         return {
             f"{name}_median": float(np.median(self.difference)),
             f"{name}_p95": float(np.quantile(self.difference, 0.95)),
@@ -49,7 +49,7 @@ class Differences:
 
 
 def differences(surface: SurfaceMesh, options: OrganOptions, n: int) -> dict[str, float]:
-    """Figures of the organ turned, and of its coarser mesh, beside the organ as it is given.
+    """Return figures of the organ turned, and of its coarser mesh, beside the organ as it is given.
 
     All three are held, and open to tools, at the same points: rules go by the axes.
     """
@@ -74,7 +74,7 @@ def differences(surface: SurfaceMesh, options: OrganOptions, n: int) -> dict[str
 
 
 def _groups(mesh: TetMesh) -> dict[str, np.ndarray]:
-    """Corners and middles of the faces that the rules clamp and open [m]."""
+    """Return the corners and middles of the faces that the rules clamp and open [m]."""
     regions, corners = regions_by_rule(mesh), mesh.vertices[mesh.boundary_faces]
     points = np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1)
     return {name: points[getattr(regions, name)].reshape(-1, 3) for name in REGIONS}

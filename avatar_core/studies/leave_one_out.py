@@ -135,7 +135,7 @@ class LeaveOneOutStudy(Study[LeaveOneOutSettings]):
         )
 
     def summary(self, run: Run[LeaveOneOutSettings]) -> dict[str, float]:
-        """Best setting of each method; for k = 10 the best regularisation and alignment."""
+        """Return best setting of each method; for k = 10 the best regularisation and alignment."""
         lle = where(run.rows, method="LLE")
         top, ten = _best(lle), _best(where(lle, k=K_PAPER) or lle)
         summary = {
@@ -192,7 +192,7 @@ STUDY = LeaveOneOutStudy()
 
 
 def placed(livers: Livers, alignment: str, settings: LeaveOneOutSettings) -> Base:
-    """All livers on one grid, centred or laid on the phantom."""
+    """Return all livers on one grid, centred or laid on the phantom."""
     scales, notices = np.ones(len(livers.surfaces)), list[str]()
     if alignment == "centred":
         moved = [centred(surface) for surface in livers.surfaces]
@@ -213,7 +213,7 @@ def placed(livers: Livers, alignment: str, settings: LeaveOneOutSettings) -> Bas
 
 
 def _upright(surface: SurfaceMesh, reference: SurfaceMesh) -> SurfaceMesh:
-    """The surface with its axes along those of the reference, if it is turned."""
+    """Return the surface with its axes along those of the reference, if it is turned."""
     offset = orientation_offset(surface, reference)
     if not offset.is_turned:
         return surface
@@ -221,7 +221,7 @@ def _upright(surface: SurfaceMesh, reference: SurfaceMesh) -> SurfaceMesh:
 
 
 def methods(base: Base, settings: LeaveOneOutSettings) -> list[Method]:
-    """LLE in all settings, then the rivals."""
+    """Return LLE in all settings, then the rivals."""
     n = len(base.vectors)
     choices = [
         (k or n - 1, r) for k in settings.neighbors for r in settings.regularizations if k < n
@@ -242,7 +242,7 @@ def methods(base: Base, settings: LeaveOneOutSettings) -> list[Method]:
 
 
 def judged(base: Base, method: Method) -> Row:
-    """Mean and worst over all livers: Dice, largest distance error inside [mm], sum |w|."""
+    """Return mean and worst over all livers: Dice, largest distance error inside [mm], sum |w|."""
     n = len(base.vectors)
     weights = np.zeros((n, n))
     for i in range(n):
@@ -267,7 +267,7 @@ def judged(base: Base, method: Method) -> Row:
 
 
 def overlap(blend: FloatArray, target: FloatArray, box: GridBox) -> float:
-    """Dice of a blended level set with a distance; 0 if the blend has no surface."""
+    """Return the Dice of a blended level set with a distance; 0 if the blend has no surface."""
     if not (blend < 0).any():
         return 0.0
     return dice(sharpened(as_grid(blend, box)), as_grid(target, box))
@@ -298,12 +298,12 @@ def lle_weights(gram: Gram, k: int, regularization: float, i: int, others: IntAr
 
 
 def hull_weights(gram: Gram, i: int, others: IntArray) -> FloatArray:
-    """The closest point of the convex hull of all others."""
+    """Return the closest point of the convex hull of all others."""
     return convex_weights(_local(gram, i, others))
 
 
 def inverse_weights(gram: Gram, k: int, i: int, others: IntArray) -> FloatArray:
-    """Proportional to 1 / distance among the k nearest others."""
+    """Return the proportional to 1 / distance among the k nearest others."""
     distance = np.sqrt(gram.squared_distances(np.array([i]))[0, others])
     weights = 1.0 / np.maximum(distance, 1e-12)
     weights[np.argsort(distance, kind="stable")[k:]] = 0.0
@@ -328,7 +328,7 @@ def principal_weights(gram: Gram, n_components: int, i: int, others: IntArray) -
 
 
 def _local(gram: Gram, i: int, near: IntArray) -> FloatArray:
-    """C_jk = (X_j - x) . (X_k - x), shape (k, k)."""
+    """Return C_jk = (X_j - x) . (X_k - x), shape (k, k)."""
     cross = gram.products[i, near]
     return gram.products[np.ix_(near, near)] - cross - cross[:, None] + gram.squared_lengths[i]
 

@@ -129,7 +129,7 @@ STUDY = MeshesStudy()
 
 
 def _meshed(surface: SurfaceMesh, settings: MeshesSettings) -> tuple[Row, TetMesh]:
-    """A row of the study, with units in its keys, and the mesh."""
+    """Return a row of the study, with units in its keys, and the mesh."""
     start = cpu_seconds()
     mesh = tetrahedralize(surface, settings.n_vertices)
     regions_by_rule(mesh)
@@ -154,7 +154,7 @@ def _meshed(surface: SurfaceMesh, settings: MeshesSettings) -> tuple[Row, TetMes
 
 
 def _points_on(mesh: TetMesh, n: int) -> np.ndarray:
-    """Random points of the boundary, uniform over its area, shape (n, 3) [m]."""
+    """Return the random points of the boundary, uniform over its area, shape (n, 3) [m]."""
     rng = np.random.default_rng(0)
     share = mesh.face_areas / mesh.face_areas.sum()
     face = mesh.boundary_faces[rng.choice(len(share), n, p=share)]
@@ -167,7 +167,7 @@ def _same(one: TetMesh, other: TetMesh) -> bool:
 
 
 def _certified(surface: SurfaceMesh, settings: MeshesSettings, refined: bool) -> Row:
-    """Errors of the vademecum's certificate, relative, and processor time of its build [s].
+    """Return errors of the vademecum's certificate, relative, and processor time of its build [s].
 
     refined : measure the error of the mesh as well; the time then includes it and is left out
     """

@@ -138,7 +138,7 @@ def _rival(method: str, error: float, timing: StepRow) -> Row:
 
 
 def _solutions(elasticity: Elasticity, centers: np.ndarray, radius: float) -> np.ndarray:
-    """Full solutions for unit forces in x, y, z, shape (3 n_vertices, 3 n), load by load."""
+    """Return full solutions for unit forces in x, y, z, shape (3 n_vertices, 3 n), load by load."""
     parts = [
         elasticity.at_vertices(elasticity.solve(patch_loads(elasticity, centers[batch], radius)))
         for batch in np.array_split(np.arange(len(centers)), -(-len(centers) // _BATCH))
@@ -167,7 +167,7 @@ def _table_errors(
 def _optimum_rows(
     curve: AccuracyCurve, snapshots: np.ndarray, truth: np.ndarray, mass: np.ndarray
 ) -> list[Row]:
-    """The best n modes for the snapshots, on other loads; as fast as ours of one region."""
+    """Return the best n modes for the snapshots, on other loads; as fast as ours of one region."""
 
     def scaled_of(field: np.ndarray) -> np.ndarray:
         return np.asarray(np.sqrt(mass)[:, None] * field / l2_norm(field, mass))
@@ -204,6 +204,6 @@ def cost_of_effects(vademecum: Vademecum) -> list[Row]:
 
 
 def fastest_within(rows: Sequence[Row], error: float) -> Row | None:
-    """The fastest row of a vademecum within an error."""
+    """Return the fastest row of a vademecum within an error."""
     found = [row for row in rows if row["method"] == "vademecum" and row["error"] <= error]  # type: ignore[operator]
     return min(found, key=lambda row: row["p50_us"], default=None)  # type: ignore[arg-type,return-value]

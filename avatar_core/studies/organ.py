@@ -56,14 +56,14 @@ class Organ:
         return Provenance(self.outline.name, self.outline.source_sha256)
 
     def linear(self, rule: BuildRule, progress: Progress) -> Vademecum:
-        """The vademecum of its material."""
+        """Return the vademecum of its material."""
         common = (self.outline.name, self.elasticity, self.regions, self.loads)
         return build_vademecum(*common, self.tip_field, rule, self.provenance, progress)
 
     def parametric(
         self, coordinates: tuple[Coordinate, ...], rule: BuildRule, progress: Progress
     ) -> Vademecum:
-        """The vademecum over some coordinates."""
+        """Return the vademecum over some coordinates."""
         common = (self.outline.name, self.elasticity, self.regions, self.loads)
         return build_parametric_vademecum(
             *common, coordinates, self.tip_field, rule, self.provenance, progress

@@ -161,7 +161,7 @@ def _hands() -> list[tuple[str, float, float, float, float, int]]:
 
 
 def map_row(delay: int, damping: float, stiffness: float, n: int) -> Row:
-    """One cell of the map."""
+    """Return one cell of the map."""
     loop = Loop(Device(MAP_MASS, damping), stiffness, delay, RESOLUTION)
     row: Row = {"kind": "map", "delay": delay, "damping": damping}
     row |= {"stiffness": stiffness, "mass": MAP_MASS, "grip": 0.0}
@@ -169,7 +169,7 @@ def map_row(delay: int, damping: float, stiffness: float, n: int) -> Row:
 
 
 def border_row(delay: int, stiffness: float) -> Row:
-    """Damping at the border of stability, found and expected [N s/m]."""
+    """Return the damping at the border of stability, found and expected [N s/m]."""
     return {
         "kind": "border",
         "delay": delay,
@@ -182,7 +182,7 @@ def border_row(delay: int, stiffness: float) -> Row:
 def hand_row(
     hand: str, mass: float, damping: float, grip: float, stiffness: float, delay: int, n: int
 ) -> Row:
-    """One tool in one hand."""
+    """Return one tool in one hand."""
     loop = Loop(Device(mass, damping, grip), stiffness, delay, RESOLUTION)
     row: Row = {"kind": hand, "delay": delay, "damping": damping}
     row |= {"stiffness": stiffness, "mass": mass, "grip": grip}
@@ -219,7 +219,7 @@ def controller(delay: int) -> Passivity:
 
 
 def _with_and_without(loop: Loop, push: FloatArray) -> Row:
-    """Energy given by the port [mJ] and what control changes of the force, relative."""
+    """Return the energy given by the port [mJ] and what control changes of the force, relative."""
     free = run_loop(loop, push, START)
     limited = run_loop(loop, push, START, controller(loop.delay))
     meant = np.concatenate([np.zeros(loop.delay), limited.organ])[: len(push)]
@@ -232,7 +232,7 @@ def _with_and_without(loop: Loop, push: FloatArray) -> Row:
 
 
 def _at(across: float, up: float) -> tuple[float, float]:
-    """A place in a panel, as fractions of its logarithmic axes."""
+    """Return a place in a panel, as fractions of its logarithmic axes."""
     (left, right), (low, high) = STIFFNESS, DAMPING
     return left * (right / left) ** across, low * (high / low) ** up
 

@@ -96,7 +96,7 @@ class PGDStudy(Study[PGDSettings]):
             return float(column(where(run.rows, method=method, modes=11, loads=kind), key)[0])
 
         def modes_for(method: str, kind: str) -> float:
-            """The least number that leaves less than ``ENOUGH``."""
+            """Return the least number that leaves less than ``ENOUGH``."""
             found = where(run.rows, method=method, loads=kind)
             modes = column(found, "modes")[column(found, "l2_mean") < ENOUGH]
             return float(modes[0]) if len(modes) else float("nan")
@@ -157,14 +157,14 @@ STUDY = PGDStudy()
 
 
 def spread(positions: LoadSurface, n: int) -> IntArray:
-    """Numbers of load vertices that are far from one another, the middle one first."""
+    """Return the numbers of load vertices that are far from one another, the middle one first."""
     points = positions.centers[: len(positions.vertices)]
     middle = int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmin())
     return farthest_points(points, n, middle)
 
 
 def make_case(elasticity: Elasticity, positions: LoadSurface, nodes: IntArray, kind: str) -> Case:
-    """Unit loads in one direction, the mean inward normal, on patches or single nodes."""
+    """Return unit loads in one direction, the mean inward normal, on patches or single nodes."""
     direction = -positions.normals[nodes].mean(axis=0)
     direction /= np.linalg.norm(direction)
     centers = positions.centers[nodes]
@@ -188,7 +188,7 @@ def make_case(elasticity: Elasticity, positions: LoadSurface, nodes: IntArray, k
 
 
 def _rows(case: Case, kind: str) -> list[Row]:
-    """Errors against modes for every method."""
+    """Return the errors against modes for every method."""
     n = case.loads.shape[1]
     ranks = sorted({*range(1, 12), *range(12, min(61, n), 3), min(n, 60)})
     found: list[Row] = []

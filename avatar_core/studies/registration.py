@@ -104,7 +104,7 @@ STUDY = RegistrationStudy()
 def registration_section(
     surface: SurfaceMesh, settings: CertaintySettings, bar: ProgressBar
 ) -> Section:
-    """A vademecum registered to deformations of another mesh."""
+    """Return a vademecum registered to deformations of another mesh."""
     sizes = RegistrationSettings(
         n_vertices=settings.n_vertices,
         n_true=int(_FINER * settings.n_vertices),
@@ -132,7 +132,7 @@ def registration_section(
 
 
 def case_rows(vademecum: Vademecum, truth: Truth, settings: RegistrationSettings) -> list[Row]:
-    """All cases of one vademecum and the true mesh of its organ."""
+    """Return all cases of one vademecum and the true mesh of its organ."""
     rows = []
     for kind in CLASSES:
         rng = np.random.default_rng(CLASSES.index(kind))
@@ -184,7 +184,7 @@ def draw_determined(axes: Axes, shown: Shown) -> None:
 
 
 def others_summed_up(rows: Sequence[Row]) -> dict[str, float]:
-    """Mean errors of point forces by prior, of packing, and of a pneumoperitoneum."""
+    """Return the mean errors of point forces by prior, of packing, and of a pneumoperitoneum."""
 
     def mean(kind: str, prior: str, key: str = "error") -> float:
         some = [r for r in rows if str(r["class"]).startswith(kind) and r["prior"] == prior]
@@ -202,7 +202,7 @@ def others_summed_up(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def measured(vademecum: Vademecum, case: Case) -> Row:
-    """Errors of all methods, over the mean and the largest true displacement."""
+    """Return the errors of all methods, over the mean and the largest true displacement."""
     size = np.linalg.norm(case.displacement, axis=1)
     mean, peak = float(case.volume @ size), float(size.max())
     start = time.process_time()
@@ -283,12 +283,12 @@ def draw_coverage(axes: Axes, rows: Sequence[Row]) -> None:
 
 
 def _by_class(rows: Sequence[Row], key: str) -> list[float]:
-    """Means of each class."""
+    """Return the means of each class."""
     return [float(column(_of(rows, kind), key).mean()) for kind in CLASSES]
 
 
 def _of(rows: Sequence[Row], kind: str | None) -> Sequence[Row]:
-    """Rows of a class; None for all."""
+    """Return the rows of a class; None for all."""
     return rows if kind is None else [row for row in rows if row["class"] == kind]
 
 

@@ -43,7 +43,7 @@ class Prior:
     zone: bool = False
 
     def of(self, case: Case) -> RegistrationRule:
-        """The rule, with the zone of a case if that is known."""
+        """Return the rule, with the zone of a case if that is known."""
         if not self.zone or case.force_at is None:
             return self.rule
         x, y, z = case.force_at
@@ -99,7 +99,7 @@ def _shown(vademecum: Vademecum, case: Case) -> Shown:
 
 
 def on_small_clamp(organ: SurfaceMesh, truth: Truth, n_vertices: int) -> Vademecum:
-    """The vademecum of an organ that is held where the truth is."""
+    """Return the vademecum of an organ that is held where the truth is."""
     with TemporaryDirectory() as folder:
         groups = Path(folder, "groups.npz")
         np.savez(groups, allow_pickle=False, **truth.groups())
@@ -108,7 +108,7 @@ def on_small_clamp(organ: SurfaceMesh, truth: Truth, n_vertices: int) -> Vademec
 
 
 def answers(vademecum: Vademecum, case: Case, priors: tuple[Prior, ...]) -> list[Row]:
-    """A row for each prior and rival."""
+    """Return a row for each prior and rival."""
     corners, weights = carriers(vademecum.mesh, case.rest)
 
     def carried(values: FloatArray) -> FloatArray:
@@ -169,7 +169,7 @@ def in_zone(vademecum: Vademecum, case: Case) -> FloatArray:
 
 
 def _errors(case: Case, place: FloatArray, seen: FloatArray) -> Row:
-    """Mean errors over the mean displacement, all, of what is seen, and of the rest."""
+    """Return the mean errors over the mean displacement, all, of what is seen, and of the rest."""
     mean = float(case.volume @ np.linalg.norm(case.place - case.rest, axis=1))
     off = np.linalg.norm(place - case.place, axis=1)
     return {
@@ -185,7 +185,7 @@ def _mean(values: FloatArray, volume: FloatArray, at: FloatArray) -> float:
 
 
 def table_of(rows: list[Row]) -> list[str]:
-    """One line for each truth and prior: means over the cases."""
+    """Return one line for each truth and prior: means over the cases."""
     lines = [
         "| truth | prior | error | seen | unseen | 90 % hold, seen | unseen | good | good and over "
         "5 mm off | seconds |",

@@ -115,7 +115,7 @@ class Truth:
         return cls(Hyperelasticity(mesh, NeoHookean(SOFT), held), Regions(held, ~held))
 
     def groups(self) -> dict[str, FloatArray]:
-        """Nodes of clamp and accessible surface, as a file of groups has them."""
+        """Return the nodes of clamp and accessible surface, as a file of groups has them."""
         faces = self.mesh.boundary_faces
         regions = {"clamped": self.regions.clamped, "accessible": ~self.regions.clamped}
         return {name: self.mesh.vertices[np.unique(faces[at])] for name, at in regions.items()}
@@ -123,7 +123,7 @@ class Truth:
     def other_case(
         self, kind: str, settings: RegistrationSettings, rng: np.random.Generator
     ) -> Case:
-        """A deformation of OTHERS; without noise, and without rigid motion but for a shift.
+        """Return a deformation of OTHERS; without noise, and without rigid motion but for a shift.
 
         Loads without an equilibrium are drawn again.
         """
@@ -181,7 +181,7 @@ class Truth:
         return self.problem.mesh
 
     def case(self, kind: str, settings: RegistrationSettings, rng: np.random.Generator) -> Case:
-        """A random deformation of a class, and a random view of it."""
+        """Return a random deformation of a class, and a random view of it."""
         mesh = self.mesh
         u, linear = self._solved(kind, rng, settings.peak)
         moved = TetMesh(mesh.vertices + u, mesh.tets)
@@ -219,7 +219,7 @@ class Truth:
         return u, small
 
     def _load(self, kind: str, rng: np.random.Generator) -> FloatArray:
-        """Nodal forces (3 n_nodes, 1), of any size."""
+        """Return the nodal forces (3 n_nodes, 1), of any size."""
         if kind == "turned weight":
             total = np.asarray(self.elasticity.mass.sum(axis=0)).ravel()
             return np.outer(total, rng.standard_normal(3)).reshape(-1, 1)
@@ -231,7 +231,7 @@ class Truth:
         return self._pushes(np.flatnonzero(here), rng)
 
     def _pushes(self, faces: IntArray, rng: np.random.Generator) -> FloatArray:
-        """Three patches of 20 to 40 mm, pressed, pulled and dragged."""
+        """Return three patches of 20 to 40 mm, pressed, pulled and dragged."""
         load = np.zeros((3 * self.elasticity.n_nodes, 1))
         for face in rng.choice(faces, 3):
             normal = self.mesh.face_area_normals[face] / self.mesh.face_areas[face]
@@ -272,7 +272,7 @@ class Truth:
 
 
 def _loaded(problem: Hyperelasticity, load: FloatArray) -> tuple[float, FloatArray]:
-    """The largest part of a dead load (3 n_nodes,) that has an equilibrium, and that."""
+    """Return the largest part of a dead load (3 n_nodes,) that has an equilibrium, and that."""
     rule = NewtonRule(tolerance=1e-4, exact_stability=False)
     for part in _PARTS:
         try:
@@ -291,7 +291,7 @@ def _moved_with_clamp(problem: Hyperelasticity, moved: FloatArray) -> FloatArray
 
 
 def _settled(problem: Hyperelasticity, u: FloatArray) -> FloatArray:
-    """The equilibrium near u, its clamped nodes where they are: Newton's method."""
+    """Return the equilibrium near u, its clamped nodes where they are: Newton's method."""
     for _ in range(_MOST_ITERATIONS):
         forces = problem.forces(u)
         left = forces[problem.free]
@@ -303,7 +303,7 @@ def _settled(problem: Hyperelasticity, u: FloatArray) -> FloatArray:
 
 
 def _seen_faces(mesh: TetMesh, seen: float, rng: np.random.Generator) -> IntArray:
-    """Faces about a point that look towards a view from the front, a part of the area."""
+    """Return faces about a point that look towards a view from the front, a part of the area."""
     unit = mesh.face_area_normals / mesh.face_areas[:, None]
     view = np.array([0.0, 1.0, 0.0]) + 0.5 * rng.standard_normal(3)
     front = np.flatnonzero(unit @ view > _FRONT * np.linalg.norm(view))
@@ -316,7 +316,7 @@ def _seen_faces(mesh: TetMesh, seen: float, rng: np.random.Generator) -> IntArra
 def _seen_points(
     mesh: TetMesh, faces: IntArray, settings: RegistrationSettings, rng: np.random.Generator
 ) -> FloatArray:
-    """Points evenly spread over faces, with noise."""
+    """Return the points evenly spread over faces, with noise."""
     n, area = settings.n_points, mesh.face_areas[faces]
     chosen = mesh.boundary_faces[rng.choice(faces, n, p=area / area.sum())]
     at = rng.dirichlet(np.ones(3), n)
@@ -325,7 +325,7 @@ def _seen_points(
 
 
 def _in_ball(rng: np.random.Generator, on_sphere: bool = False) -> FloatArray:
-    """A random vector no longer than one, or just as long."""
+    """Return a random vector no longer than one, or just as long."""
     direction = rng.standard_normal(3)
     length = 1.0 if on_sphere else rng.uniform() ** (1.0 / 3.0)
     return np.asarray(direction * length / np.linalg.norm(direction))

@@ -38,7 +38,7 @@ def unit_load_response(
 
 
 def relative_errors(found: FloatArray, wanted: FloatArray, mesh: TetMesh) -> FloatArray:
-    """|u - u_ref| / |u_ref| in L2 over the organ for each load, shape (n_loads,).
+    """Return |u - u_ref| / |u_ref| in L2 over the organ for each load, shape (n_loads,).
 
     found, wanted : ndarray, shape (n_vertices, 3, n_loads), at the vertices of the mesh
     """

@@ -83,7 +83,7 @@ class SamplesStudy(Study[SamplesSettings]):
         run.notices.append("the paper's Fig. 7 prints no numbers: the error falls monotonically")
 
     def summary(self, run: Run[SamplesSettings]) -> dict[str, float]:
-        """Errors at the ends, the rate p of error ~ n^-p, and the times."""
+        """Return the errors at the ends, the rate p of error ~ n^-p, and the times."""
         (timing,), rows = where(run.rows, kind="time"), where(run.rows, kind="error")
         n, error, worst = (column(rows, key) for key in ("n_samples", "error", "error_worst"))
         summary: dict[str, float] = {}
@@ -140,7 +140,7 @@ STUDY = SamplesStudy()
 
 
 def error_row(base: FloatArray, targets: FloatArray) -> Row:
-    """Error of the twelve nearest, of the nearest alone, and of LLE among all."""
+    """Return the error of the twelve nearest, of the nearest alone, and of LLE among all."""
     errors = {"error": NEIGHBORS, "nearest": 1, "all": min(len(base), 100)}
     row: Row = {"kind": "error", "n_samples": len(base)}
     for key, k in errors.items():
@@ -151,14 +151,14 @@ def error_row(base: FloatArray, targets: FloatArray) -> Row:
 
 
 def _field_error(base: FloatArray, target: FloatArray, k: int) -> float:
-    """|phi - sum_j w_j phi_j| / |phi| in L2 over the grid points inside the organ."""
+    """Return |phi - sum_j w_j phi_j| / |phi| in L2 over the grid points inside the organ."""
     inside = target < 0
     found = barycenter(base, target, k).combine(base)
     return float(np.linalg.norm((found - target)[inside]) / np.linalg.norm(target[inside]))
 
 
 def time_lle(vectors: FloatArray, repeats: int) -> Timing:
-    """Weights and embedding of all vectors, ours and scikit-learn's in turn."""
+    """Return the weights and embedding of all vectors, ours and scikit-learn's in turn."""
 
     def ours() -> LLE:
         base = fit(vectors, NEIGHBORS, regularization=TIMED_REGULARIZATION)

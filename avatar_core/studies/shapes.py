@@ -46,7 +46,7 @@ class Livers:
 
 
 def read_livers(folder: Path | None, n: int | None, phantoms: int) -> Livers:
-    """Surfaces of a folder: all, or n evenly chosen ones.
+    """Return the surfaces of a folder: all, or n evenly chosen ones.
 
     folder : None for ../shared/data/livers, or bent phantoms if that does not exist
     n : maximum number; None for all
@@ -94,7 +94,7 @@ def read_liver(folder: Path | None, name: str) -> SurfaceMesh:
 
 
 def subject_numbers(names: Sequence[str]) -> IntArray:
-    """Number of the person of each scan, shape (n,)."""
+    """Return the number of the person of each scan, shape (n,)."""
     person = {name: scans[0] for scans in SAME_SUBJECT for name in scans}
     _, number = np.unique([person.get(name, name) for name in names], return_inverse=True)
     return number.astype(np.int64)
@@ -111,7 +111,7 @@ def paper_box(surfaces: Sequence[SurfaceMesh], shape: tuple[int, int, int]) -> G
 
 
 def distance_vectors(surfaces: Sequence[SurfaceMesh], box: GridBox) -> FloatArray:
-    """Signed distances of all surfaces at the points of the box, shape (n, n_points) [m]."""
+    """Return signed distances of all surfaces at the points of the box, shape (n, n_points) [m]."""
     vectors = np.empty((len(surfaces), int(np.prod(box.shape))))
     for row, surface in zip(vectors, follow(surfaces, "distance fields"), strict=True):
         row[:] = distance_in_box(surface, box).values.ravel()
@@ -119,12 +119,12 @@ def distance_vectors(surfaces: Sequence[SurfaceMesh], box: GridBox) -> FloatArra
 
 
 def as_grid(vector: FloatArray, box: GridBox) -> DistanceGrid:
-    """A vector of distances back on its grid."""
+    """Return a vector of distances back on its grid."""
     return DistanceGrid(np.array(box.origin), box.spacing, vector.reshape(box.shape))
 
 
 def centred(surface: SurfaceMesh) -> SurfaceMesh:
-    """The surface with its centroid of volume at the origin."""
+    """Return the surface with its centroid of volume at the origin."""
     grid = distance_grid(surface, spacing=float(surface.extent.max()) / 24, padding=0.0)
     middle = grid.points[grid.values.ravel() < 0].mean(axis=0)
     return replace(surface, vertices=surface.vertices - middle)

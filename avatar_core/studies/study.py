@@ -64,7 +64,7 @@ class Study(ABC, Generic[S]):
 
     @abstractmethod
     def sentence(self, run: Run[S]) -> str:
-        """The finding, in one sentence, for the picture."""
+        """Return the finding, in one sentence, for the picture."""
 
     @abstractmethod
     def draw(self, figure: Figure, run: Run[S]) -> None:
@@ -129,7 +129,7 @@ class Run(Generic[S]):
         return self.study.sentence(self)
 
     def table(self) -> str:
-        """The summary beside the values of the paper."""
+        """Return the summary beside the values of the paper."""
         width = max(len(key) for key in self.summary)
         lines = [f"{'':{width}s} {'paper':>24s} {'here':>12s}"]
         for key, value in self.summary.items():
@@ -168,7 +168,7 @@ class Run(Generic[S]):
 
 
 def machine() -> dict[str, Value]:
-    """Processor, cores, load and versions."""
+    """Return the processor, cores, load and versions."""
     found: dict[str, Value] = {
         "processor": processor(),
         "cores": os.cpu_count(),
@@ -211,7 +211,7 @@ def _line(row: Row) -> str:
 
 
 def _parsed(line: str) -> Row | None:
-    """A row, with NaN for null; None for a line that was cut off."""
+    """Return a row, with NaN for null; None for a line that was cut off."""
     try:
         row: Row = json.loads(line)
     except ValueError:
@@ -220,12 +220,12 @@ def _parsed(line: str) -> Row | None:
 
 
 def where(rows: Iterable[Row], **wanted: Value) -> list[Row]:
-    """Rows whose columns have these values, e.g. ``kind="map", delay=0``."""
+    """Return the rows whose columns have these values, e.g. ``kind="map", delay=0``."""
     return [row for row in rows if all(row.get(key) == value for key, value in wanted.items())]
 
 
 def column(rows: Iterable[Row], key: str) -> NDArray[np.float64]:
-    """The numbers of a column, in the rows that have it."""
+    """Return the numbers of a column, in the rows that have it."""
     return np.array([row[key] for row in rows if key in row], float)
 
 
@@ -291,7 +291,7 @@ class ProgressBar:
 
 
 def mean_and_worst(key: str, values: Iterable[float]) -> dict[str, float]:
-    """Mean under ``key`` and maximum under ``key_worst``; NaN if there are no values."""
+    """Return the mean under ``key`` and maximum under ``key_worst``; NaN if there are no values."""
     found = [float(value) for value in values]
     if not found:
         return {key: math.nan, f"{key}_worst": math.nan}

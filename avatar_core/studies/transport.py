@@ -118,7 +118,7 @@ class TransportStudy(Study[TransportSettings]):
                 run.add(transport_row(surface, base, options))
 
     def summary(self, run: Run[TransportSettings]) -> dict[str, float]:
-        """Means, and the worst load of all patients."""
+        """Return the means, and the worst load of all patients."""
         return summarized(run.rows)
 
     def sentence(self, run: Run[TransportSettings]) -> str:
@@ -163,7 +163,7 @@ STUDY = TransportStudy()
 
 
 def summarized(rows: Sequence[Row]) -> dict[str, float]:
-    """The summary of the study."""
+    """Return the summary of the study."""
 
     def mean(key: str) -> float:
         return float(column(rows, key).mean())
@@ -188,7 +188,7 @@ def summarized(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def leave_one_out_table(base: PatientBase) -> list[str]:
-    """Errors of each weighting by its settings: all members, each from the others.
+    """Return the errors of each weighting by its settings: all members, each from the others.
 
     Relative L2 errors of displacement node by node on the template, for some load positions.
     """
@@ -217,7 +217,7 @@ def _left_out(
     ridge: float,
     moved: np.ndarray,
 ) -> float:
-    """Mean error of a member from the others; those of the same person are left out."""
+    """Return the mean error of a member from the others; those of the same person are left out."""
     out = sorted({*leave_one_out(base, base.names[i], SAME_SUBJECT), *base.copies})
     k = min(k, len(base.names) - len(out))
     if kind == "kriging":
@@ -237,7 +237,7 @@ def _column_of(kind: Weighting) -> str:
 
 
 def _atlas(surfaces: Sequence[SurfaceMesh], path: Path, settings: TransportSettings) -> Atlas:
-    """The atlas of the study; one that was stopped goes on."""
+    """Return the atlas of the study; one that was stopped goes on."""
     from tqdm import tqdm
 
     options = AtlasOptions(template_vertices=settings.template_vertices)
@@ -254,7 +254,7 @@ def _atlas(surfaces: Sequence[SurfaceMesh], path: Path, settings: TransportSetti
 
 
 def _patients(members: Sequence[SurfaceMesh], n: int) -> list[SurfaceMesh]:
-    """Members drawn evenly, one scan of each person."""
+    """Return the members drawn evenly, one scan of each person."""
     further = {name for scans in SAME_SUBJECT for name in sorted(scans)[1:]}
     persons = [surface for surface in members if surface.name not in further]
     chosen = np.linspace(0, len(persons) - 1, min(n, len(persons))).astype(int)
@@ -262,7 +262,7 @@ def _patients(members: Sequence[SurfaceMesh], n: int) -> list[SurfaceMesh]:
 
 
 def transport_row(surface: SurfaceMesh, base: PatientBase, options: PatientOptions) -> Row:
-    """All fidelities of one patient against full finite elements.
+    """Return all fidelities of one patient against full finite elements.
 
     Errors are means over load positions unless they say worst. CPU seconds are those of
     ``reduced`` after mesh and registration, and of its response alone, without what contact needs
@@ -326,7 +326,7 @@ def transport_row(surface: SurfaceMesh, base: PatientBase, options: PatientOptio
 
 
 def _file_seconds(surface: SurfaceMesh, vademecum: Vademecum) -> float:
-    """Processor time to read the surface from an OBJ and to write the vademecum [s]."""
+    """Return the processor time to read the surface from an OBJ and to write the vademecum [s]."""
     with TemporaryDirectory() as folder:
         organ, response = Path(folder, "organ.obj"), Path(folder, "organ.h5")
         igl.write_triangle_mesh(str(organ), 1e3 * surface.vertices, surface.faces)
@@ -374,12 +374,12 @@ class _Truth:
         return np.asarray(np.sqrt(np.concatenate(squared).reshape(-1, 3).sum(axis=1)))
 
     def of_response(self, response: CompactResponse) -> np.ndarray:
-        """Relative error at each load position."""
+        """Return the relative error at each load position."""
         space, load = response.space.astype(np.float32), response.load.astype(np.float32)
         return self._norms(lambda part: space @ load[part].T - self._columns[:, part]) / self._size
 
     def of_vademecum(self, vademecum: Vademecum) -> tuple[np.ndarray, np.ndarray]:
-        """Relative errors of displacement and patch compliance at each load position."""
+        """Return the relative errors of displacement and patch compliance at each load position."""
         one = np.ones(1)
 
         def off(part: slice) -> np.ndarray:
@@ -394,7 +394,7 @@ class _Truth:
         return self._norms(off) / self._size, np.array(contact)
 
     def with_clamp_by_rule(self, registration: Registration, n: int = 60) -> float:
-        """Mean error of the clamp that the anatomical rule finds on the patient itself."""
+        """Return mean error of the clamp that the anatomical rule finds on the patient itself."""
         problem = self._problem
         clamped = regions_by_rule(problem.mesh).clamped
         other = Elasticity(problem.mesh, problem.elasticity.material, clamped)

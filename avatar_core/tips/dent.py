@@ -75,10 +75,14 @@ DENT_STATE = kind(
 def dent_arrays(
     tips: Sequence[Tip], points: np.ndarray, positions: np.ndarray, patch_radius: float
 ) -> Any:
-    """Tables that replace the dents of patches by those of tips, a tuple of DENT.
+    """Return the tables that replace the dents of patches by those of tips, a tuple of DENT.
 
-    points : ndarray, shape (n_points, 3), of the cloud at rest [m]
-    positions : ndarray, shape (n_positions, 3), of the patches [m]
+    Parameters
+    ----------
+    points : ndarray, shape (n_points, 3)
+        Points of the cloud at rest [m].
+    positions : ndarray, shape (n_positions, 3)
+        Positions of the patches [m].
     """
     theta, weight = quarter_turn(NODES)
     start, around = points_around(points, positions, patch_radius)
@@ -97,7 +101,8 @@ def points_around(
     points: np.ndarray, centres: np.ndarray, patch_radius: float
 ) -> tuple[np.ndarray, ...]:
     """Points that a tip near each centre may move: start (n + 1,), and their numbers, nearest
-    first."""
+    first.
+    """
     # Here, because the contact node needs none of it.
     from scipy.spatial import cKDTree
 
@@ -117,10 +122,17 @@ def add_dents(  # type: ignore[no-untyped-def]
 ):
     """Replace the dent of the patch by that of each tip in contact, in a displacement.
 
-    start, around : of points near load positions; rest : of all points [m]
-    field : numbers of the points that are changed, ``width`` of each: 3, their displacement, or 6,
-        their position and displacement
-    tip, patch : 1 or 0, whether the dent of the tip is put in, and that of the patch taken off
+    Parameters
+    ----------
+    start, around
+        Start and around of points near load positions.
+    rest
+        Rest of all points [m].
+    field
+        Numbers of the points that are changed, ``width`` of each: 3, their displacement, or 6,
+        their position and displacement.
+    tip, patch
+        1 or 0, whether the dent of the tip is put in, and that of the patch taken off.
     """
     if not model.law.on or not model.dent.on:
         return
@@ -185,7 +197,7 @@ def _add_disc(  # type: ignore[no-untyped-def]
 
 @fast
 def _fading(part):  # type: ignore[no-untyped-def]
-    """h at the square of a distance over that of the reach."""
+    """Return h at the square of a distance over that of the reach."""
     left = min(1.0, (1.0 - part) / (1.0 - (FADE / REACH) ** 2))
     return left * left * (3.0 - 2.0 * left)
 
@@ -193,7 +205,8 @@ def _fading(part):  # type: ignore[no-untyped-def]
 @fast
 def _nearest_position(model, data, t):  # type: ignore[no-untyped-def]
     """The load position nearest to the point under a tip, of those that carry it; its distance
-    squared [m^2]."""
+    squared [m^2].
+    """
     nearest, least = 0, 1e9
     for i in range(data.n_nodes[t]):
         p, s = model.position[data.nodes[t, i]], data.point[t]

@@ -70,7 +70,7 @@ def with_least(law: np.ndarray) -> np.ndarray:
 
 @fast
 def evaluate_large_dent(model, t, load):  # type: ignore[no-untyped-def]
-    """eta [m], its derivative by the load F / E* [1/m] and Psi [m^3]."""
+    """Return eta [m], its derivative by the load F / E* [1/m] and Psi [m^3]."""
     c, radius = model.law.large_dent[t], model.law.radius[t]
     cube = 0.75 * load / (radius * radius)
     inside = min(cube, c[END])

@@ -94,7 +94,7 @@ LAW_STATE = kind(
 
 
 def of_planes(n_tips: int) -> ShapeFactor:
-    """Zero everywhere: one brick that is none."""
+    """Return zero everywhere: one brick that is none."""
     value = np.zeros((n_tips, 0, BRICK, BRICK, BRICK), np.float32)
     return ShapeFactor(np.full((1, 1, 1), -1, np.int32), value, np.array([_EVERYWHERE]))
 
@@ -107,13 +107,20 @@ def law_arrays(
     error_factor: float = 1.0,
     neo_hookean: bool = False,
 ) -> Any:
-    """Tables of the tips; None where all are patches.
+    """Return the tables of the tips; None where all are patches.
 
-    material : of the organ
-    local : ndarray float32, shape (2, nx, ny, nz), E* and c
-    shape : of each tip; None for a plane
-    error_factor : on the law's error
-    neo_hookean : whether the dents of spheres are those of large strain
+    Parameters
+    ----------
+    material : Material
+        Material of the organ.
+    local : ndarray
+        float32, shape (2, nx, ny, nz), E* and c.
+    shape : ShapeFactor or None
+        Shape of each tip; None for a plane.
+    error_factor : float
+        Error factor on the law's error.
+    neo_hookean : bool
+        Whether the dents of spheres are those of large strain.
 
     Raises
     ------
@@ -139,7 +146,7 @@ def law_arrays(
 
 @inlined
 def sample_law(model, data, t, tip):  # type: ignore[no-untyped-def]
-    """s E* and c at a tip, with their gradients."""
+    """Return s E* and c at a tip, with their gradients."""
     law, table = data.law, model.law
     if not model.law.on:
         return
@@ -159,7 +166,8 @@ def sample_law(model, data, t, tip):  # type: ignore[no-untyped-def]
 @fast
 def _at_place(model, data, t):  # type: ignore[no-untyped-def]
     """Weights of cubic Hermite interpolation and both ends of the table's interval at ``place``,
-    the place within it, and the depth beyond the tip's full radius."""
+    the place within it, and the depth beyond the tip's full radius.
+    """
     s = data.law.place[t]
     i = min(int(min(s, 1.0) * INTERVALS), INTERVALS - 1)
     u = min(s, 1.0) * INTERVALS - i
@@ -187,7 +195,7 @@ def _hermite(weights, p, q, p_slope, q_slope):  # type: ignore[no-untyped-def]
 
 @fast
 def dent(model, data, t):  # type: ignore[no-untyped-def]
-    """delta [m], its slope by s, F / E* [m^2] and the contact radius a [m] at ``place``."""
+    """Return delta [m], its slope by s, F / E* [m^2] and the contact radius a [m] at ``place``."""
     w, p, q, u, wall = _at_place(model, data, t)
     a = _hermite(w, p[0], q[0], p[1], q[1])
     g = _hermite(w, p[2], q[2], p[3], q[3])
@@ -224,7 +232,8 @@ def tangential_compliance(model, data, t):  # type: ignore[no-untyped-def]
 def law_error(model, data, t):  # type: ignore[no-untyped-def]
     """Relative error of the force by the law alone: over tumours, where the surface is no plane,
     where the gap grows by another length than the tip moves (by as much, the force is not that of
-    its load), and where the organ is not as soft at the tip's lowest point as at the surface."""
+    its load), and where the organ is not as soft at the tip's lowest point as at the surface.
+    """
     law = data.law
     plain = law.value[t, STIFFNESS] * np.exp(-law.shape[t])
     more = TUMOUR_ERROR * abs(plain / model.law.modulus[0] - 1.0) + SHAPE_ERROR * abs(law.shape[t])

@@ -18,7 +18,7 @@ LAST = 3.0  # atanh of the last contact radius over that of a sphere
 
 
 def _contact_radius(tip: Tip, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """a(s) and da/ds: dense where a sphere's sides become steep."""
+    """Return a(s) and da/ds: dense where a sphere's sides become steep."""
     if tip.shape == "sphere":
         a = tip.radius * np.tanh(LAST * s)
         return a, LAST * (tip.radius - a**2 / tip.radius)
@@ -26,8 +26,10 @@ def _contact_radius(tip: Tip, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def profile_of(tip: Tip) -> np.ndarray:
-    """The table of one tip, shape (INTERVALS + 1, 6); see
-    :class:`avatar_core.tips.law.TipLawArrays`."""
+    """Return the table of one tip, shape (INTERVALS + 1, 6).
+
+    The columns are those of :class:`avatar_core.tips.law.TipLawArrays`.
+    """
     s = np.linspace(0.0, 1.0, INTERVALS + 1)
     node, weight = leggauss(8)
     inner = s[:-1, None] + (node + 1.0) / (2.0 * INTERVALS)
@@ -43,5 +45,5 @@ def profile_of(tip: Tip) -> np.ndarray:
 
 
 def _running(parts: np.ndarray) -> np.ndarray:
-    """Integrals from 0 to each knot."""
+    """Return the integrals from 0 to each knot."""
     return np.concatenate([[0.0], np.cumsum(parts.sum(axis=1))])

@@ -54,19 +54,20 @@ _DEEPEST = 0.1  # up to which a plane's depths are tabulated [m]
 
 
 def factor_of(field: TipField, tip: Tip) -> ShapeFactor:
-    """log s of one tip over the outline of a tip field."""
+    """Return log s of one tip over the outline of a tip field."""
     grid = _Grid(field, tip)
     return _in_bricks([grid.splines(*grid.pressed(OffsetGrid(field.outline)))])
 
 
 def together(factors: Sequence[ShapeFactor]) -> ShapeFactor:
-    """log s of several tips over one organ."""
+    """Return log s of several tips over one organ."""
     return _in_bricks([dense(one.value[0], one.brick) for one in factors])
 
 
 class _Plane:
     """Load F / E* and contact radius of a tip on a plane half-space, beyond its radius too: there
-    the contact grows no more."""
+    the contact grows no more.
+    """
 
     def __init__(self, tip: Tip) -> None:
         table = profile_of(tip)
@@ -76,11 +77,11 @@ class _Plane:
         self._load = np.append(load, load[-1] + 2.0 * a[-1] * _DEEPEST)
 
     def radius(self, depth: np.ndarray) -> np.ndarray:
-        """a at some depths, shape (n,) [m]."""
+        """Return a at some depths, shape (n,) [m]."""
         return np.interp(depth, self._depth, self._radius)
 
     def load(self, depth: np.ndarray) -> np.ndarray:
-        """F / E* at some depths, shape (n,) [m^2]."""
+        """Return F / E* at some depths, shape (n,) [m^2]."""
         return np.interp(depth, self._depth, self._load)
 
 
@@ -115,7 +116,7 @@ class _Grid:
         return points, np.clip(np.log(load / self._on_plane(dent)), -MOST, MOST)
 
     def _on_plane(self, depth: np.ndarray) -> np.ndarray:
-        """F_1 / E* at some depths, by the same rings, shape (n,) [m^2]."""
+        """Return F_1 / E* at some depths, by the same rings, shape (n,) [m^2]."""
         some = np.linspace(0.0, depth.max(initial=_SHALLOW), _TABLE + 1)[1:]
         under, window = self._windows(some)
         rings = loads_on_heights(under, window, np.zeros((_TABLE, *_RINGS)))
@@ -123,12 +124,12 @@ class _Grid:
         return np.asarray(part * self.plane.load(depth))
 
     def _windows(self, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The tip over the plane on all rings (n, RINGS) and their outer radii (n,) [m]."""
+        """Return the tip over the plane on all rings (n, RINGS) and their outer radii (n,) [m]."""
         window = np.minimum(WINDOW * self.plane.radius(depth), _NARROW * self.tip.radius)
         return self.tip.height(window[:, None] * ring_radii()) - depth[:, None], window
 
     def splines(self, points: np.ndarray, factor: np.ndarray) -> np.ndarray:
-        """Coefficients of log s, known at some points of the grid, held above and below."""
+        """Return coefficients of log s, known at some points of the grid, held above and below."""
         values, known = np.zeros(self.shape), np.zeros(self.shape)
         values[tuple(points.T)], known[tuple(points.T)] = factor, 1.0
         (first, last), above = PRESSED, ABOVE * SPACING
@@ -161,13 +162,13 @@ class _Grid:
 
 
 def _between_circles() -> np.ndarray:
-    """Weights of the heights on ``CIRCLES`` that interpolate those on the rings."""
+    """Return the weights of the heights on ``CIRCLES`` that interpolate those on the rings."""
     unit = np.eye(len(CIRCLES))
     return np.stack([np.interp(ring_radii(), CIRCLES, row) for row in unit], axis=1)
 
 
 def _refined(values: np.ndarray, step: float, shape: np.ndarray) -> np.ndarray:
-    """Splines at points of the same origin that lie ``step`` of their spacings apart."""
+    """Return the splines at points of the same origin that lie ``step`` of their spacings apart."""
     for axis in range(3):
         place = step * np.arange(shape[axis])
         middle = np.floor(place + 0.5).astype(int)
@@ -182,7 +183,7 @@ def _refined(values: np.ndarray, step: float, shape: np.ndarray) -> np.ndarray:
 
 
 def _in_bricks(values: Sequence[np.ndarray]) -> ShapeFactor:
-    """Fields of one shape in the bricks in which any of them does not vanish."""
+    """Return the fields of one shape in the bricks in which any of them does not vanish."""
     blocks = [_blocks(v) for v in values]
     used = np.max([np.abs(b).max(axis=(3, 4, 5)) for b in blocks], axis=0) > _LEAST
     brick = np.full(used.shape, -1, np.int32)
@@ -192,13 +193,13 @@ def _in_bricks(values: Sequence[np.ndarray]) -> ShapeFactor:
 
 
 def _blocks(values: np.ndarray) -> np.ndarray:
-    """Samples by brick, shape (nx, ny, nz, BRICK, BRICK, BRICK)."""
+    """Return the samples by brick, shape (nx, ny, nz, BRICK, BRICK, BRICK)."""
     nx, ny, nz = np.array(values.shape) // BRICK
     return values.reshape(nx, BRICK, ny, BRICK, nz, BRICK).transpose(0, 2, 4, 1, 3, 5)
 
 
 def dense(cut: np.ndarray, brick: np.ndarray) -> np.ndarray:
-    """All samples of a field in bricks, the inverse of :func:`_in_bricks`."""
+    """Return all samples of a field in bricks, the inverse of :func:`_in_bricks`."""
     whole = np.zeros(tuple(BRICK * n for n in brick.shape), np.float32)
     _blocks(whole)[brick >= 0] = cut
     return whole

@@ -25,8 +25,12 @@ _INDEX_DRAWS = 1024  # for each parameter, a power of two
 class Bands:
     """Of every place and depth.
 
-    force, moved : ndarray, shape (3, n_places, n_depths), at 5, 50 and 95 % [N, m]
-    shares : by parameter that is not fixed, ndarray (n_places, n_depths), of the force
+    Attributes
+    ----------
+    force, moved : ndarray, shape (3, n_places, n_depths)
+        Force and moved at 5, 50 and 95 % [N, m].
+    shares : Mapping[str, ndarray]
+        By parameter that is not fixed, ndarray (n_places, n_depths), of the force.
     """
 
     force: FloatArray
@@ -35,7 +39,7 @@ class Bands:
 
 
 def drawn(known: Mapping[str, Distribution], n: int, seed: int) -> dict[str, FloatArray]:
-    """Values of every parameter, each (n,)."""
+    """Return the values of every parameter, each (n,)."""
     probability = qmc.LatinHypercube(len(known), rng=np.random.default_rng(seed)).random(n)
     columns = zip(known.items(), probability.T, strict=True)
     return {name: np.asarray(one.ppf(column)) for (name, one), column in columns}
@@ -44,7 +48,7 @@ def drawn(known: Mapping[str, Distribution], n: int, seed: int) -> dict[str, Flo
 def bands_of(
     table: ForceTable, known: Mapping[str, Distribution], n: int = 1000, seed: int = 0
 ) -> Bands:
-    """The bands that n draws span, and each parameter's share of the force's."""
+    """Return the bands that n draws span, and each parameter's share of the force's."""
     values, levels = drawn(known, n, seed), (LOW, 0.5, HIGH)
     return Bands(
         np.quantile(table.force(values), levels, axis=0),

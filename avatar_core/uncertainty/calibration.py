@@ -67,11 +67,18 @@ _TAIL = 4.0  # degrees of freedom of a vademecum's error over what it states
 class Errors:
     """Standard deviations of what is off about a force.
 
-    sensor : part of the force, of each sample
-    least : of each sample [N]
-    depth : of the surface's place at a touch [m]
-    mesh : part of the force, of all samples alike
-    extent : part of a contrast or a support's stiffness, by what the mesh makes of their bodies
+    Attributes
+    ----------
+    sensor : float
+        Part of the force, of each sample.
+    least : float
+        Least of each sample [N].
+    depth : float
+        Depth of the surface's place at a touch [m].
+    mesh : float
+        Part of the force, of all samples alike.
+    extent : float
+        Part of a contrast or a support's stiffness, by what the mesh makes of their bodies.
     """
 
     sensor: float = 0.02
@@ -85,12 +92,18 @@ class Errors:
 class TouchTable:
     """Forces at the samples of a palpation, at the points of a grid of materials.
 
-    palpation : of which the touches are that the vademecum feels
-    left_out : number of touches that it does not feel
-    log_force : ndarray, shape (n_points, n_samples), ln of the force [N]
-    steepness : ndarray, shape (n_samples,), d ln F / d depth [1/m]
-    error : ndarray, shape (n_samples,), standard deviation of the vademecum's own error, a part of
-        the force
+    Attributes
+    ----------
+    palpation : Palpation
+        Palpation of which the touches are that the vademecum feels.
+    left_out : int
+        Number of touches that it does not feel.
+    log_force : ndarray, shape (n_points, n_samples)
+        Ln of the force [N].
+    steepness : ndarray, shape (n_samples,)
+        d ln F / d depth [1/m].
+    error : ndarray, shape (n_samples,)
+        Standard deviation of the vademecum's own error, a part of the force.
     """
 
     grid: MaterialGrid
@@ -107,7 +120,7 @@ class TouchTable:
 
     @property
     def measured(self) -> FloatArray:
-        """ln of the measured forces, shape (n_samples,)."""
+        """Return ln of the measured forces, shape (n_samples,)."""
         return np.asarray(np.log(self.palpation.force[self.palpation.sampled]))
 
     @property
@@ -129,9 +142,12 @@ class TouchTable:
     def covariance(
         self, errors: Errors, log_force: FloatArray, inflated: FloatArray | None = None
     ) -> FloatArray:
-        """C at forces that are expected, shape (n_samples, n_samples).
+        """Return C at forces that are expected, shape (n_samples, n_samples).
 
-        inflated : (n_touches,) factor on the variance of the vademecum's own error at each touch
+        Parameters
+        ----------
+        inflated : ndarray or None
+            (n_touches,) factor on the variance of the vademecum's own error at each touch.
         """
         same = (self.touch[:, None] == self.touch).astype(float)
         moved, own = errors.depth * self.steepness, self.error
@@ -146,12 +162,20 @@ class TouchTable:
 class Calibration:
     """What is known after a palpation.
 
-    known : before it, by parameter
-    names : of the parameters that were not fixed
-    mean, covariance : of their standard normal numbers, shapes (n,) and (n, n)
-    misfit : ndarray, shape (n_samples,), of ln F, measured less computed
-    deviations : ndarray, shape (n_touches,), the same of each touch over its standard deviation
-    probability : that so bad a fit comes by chance
+    Attributes
+    ----------
+    known : Mapping[str, Distribution]
+        Before it, by parameter.
+    names : tuple[str, ...]
+        Names of the parameters that were not fixed.
+    mean, covariance : ndarray
+        Mean and covariance of their standard normal numbers, shapes (n,) and (n, n).
+    misfit : ndarray, shape (n_samples,)
+        Misfit of ln F, measured less computed.
+    deviations : ndarray, shape (n_touches,)
+        The same of each touch over its standard deviation.
+    probability : float
+        Probability that so bad a fit comes by chance.
     """
 
     known: Mapping[str, Distribution]
@@ -173,7 +197,7 @@ class Calibration:
         return float(np.sqrt(np.mean(self.misfit**2)))
 
     def value(self, name: str, deviations: float = 0.0) -> float:
-        """The most probable value of a parameter, or one some deviations above it."""
+        """Return the most probable value of a parameter, or one some deviations above it."""
         if name not in self.names:
             return float(self.known[name].ppf(np.array(0.5)))
         k = self.names.index(name)
@@ -181,7 +205,7 @@ class Calibration:
         return float(self.known[name].ppf(ndtr(z)))
 
     def interval(self, name: str) -> tuple[float, float]:
-        """The values between which a parameter lies with 90 %."""
+        """Return the values between which a parameter lies with 90 %."""
         return self.value(name, -NINETY), self.value(name, NINETY)
 
     def posterior(self, name: str) -> Distribution:
@@ -222,7 +246,7 @@ def touch_table(
 def _of_felt(
     grid: MaterialGrid, palpation: Palpation, force: FloatArray, error: FloatArray
 ) -> TouchTable:
-    """The table of the touches whose samples are all felt."""
+    """Return the table of the touches whose samples are all felt."""
     silent = palpation.sampled & ~(force > 0.0).all(axis=0)
     felt = np.bincount(palpation.touch, silent, palpation.n_touches) == 0
     if felt.sum() < _LEAST_TOUCHES:
@@ -265,7 +289,7 @@ def _followed(model: ContactModel, palpation: Palpation) -> tuple[FloatArray, Fl
 
 
 def _steepness(palpation: Palpation, log_force: FloatArray) -> FloatArray:
-    """d ln F / d depth along the paths, shape (n,) [1/m]; zero where there is no force."""
+    """Return d ln F / d depth along the paths, shape (n,) [1/m]; zero where there is no force."""
     found = np.zeros(len(log_force))
     for touch in range(palpation.n_touches):
         here = np.flatnonzero((palpation.touch == touch) & np.isfinite(log_force))
@@ -283,9 +307,13 @@ def _steepness(palpation: Palpation, log_force: FloatArray) -> FloatArray:
 def calibrated(
     table: TouchTable, known: Mapping[str, Distribution], errors: Errors | None = None
 ) -> Calibration:
-    """The posterior of all parameters that are not fixed.
+    """Return the posterior of all parameters that are not fixed.
 
-    known : of every coordinate and "young", as :func:`avatar_core.uncertainty.known.known_of` gives
+    Parameters
+    ----------
+    known : Mapping[str, Distribution]
+        Known of every coordinate and "young", as :func:`avatar_core.uncertainty.known.known_of`
+        gives.
     """
     names = tuple(name for name, one in known.items() if not isinstance(one, Fixed))
     errors = errors or Errors()
@@ -330,7 +358,8 @@ def _extents(
     known: Mapping[str, Distribution], names: tuple[str, ...], at: FloatArray, errors: Errors
 ) -> FloatArray:
     """Variances of the standard normal numbers by ``errors.extent``, shape (n,), no larger than
-    before anything was known."""
+    before anything was known.
+    """
     found = np.zeros(len(names))
     for k, name in enumerate(names):
         if name == "contrast" or name.startswith("support."):

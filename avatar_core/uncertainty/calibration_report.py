@@ -45,7 +45,7 @@ def _unit(parameter: str) -> str:
 
 
 def verdict(table: TouchTable, found: Calibration) -> list[str]:
-    """Whether the model fits, and where it does not."""
+    """Return whether the model fits, and where it does not."""
     told = f"forces differ by {found.rms:.1%} rms; "
     told += f"a fit so bad comes by chance in {found.probability:.2g} of cases"
     if found.explained:
@@ -64,7 +64,7 @@ def verdict(table: TouchTable, found: Calibration) -> list[str]:
 
 
 def numbers(table: TouchTable, found: Calibration) -> dict[str, Any]:
-    """All figures, in SI units."""
+    """Return all figures, in SI units."""
     sampled = table.palpation.sampled
     return {
         "explained": found.explained,

@@ -29,10 +29,10 @@ class Distribution(Protocol):
     """A parameter's distribution, by its quantile function."""
 
     def ppf(self, probability: FloatArray) -> FloatArray:
-        """Values below which the parameter lies with some probabilities (0 to 1)."""
+        """Return the values below which the parameter lies with some probabilities (0 to 1)."""
 
     def cdf(self, value: float) -> float:
-        """Probability that the parameter lies below a value."""
+        """Return the probability that the parameter lies below a value."""
 
     def said(self, unit: str = "") -> str:
         """What is known, in words, with a unit."""
@@ -168,7 +168,7 @@ _EXAMPLE = "write young=lognormal:5e3:1.5, poisson=uniform:0.4:0.49 or contrast=
 
 
 def parse(text: str) -> tuple[str, Distribution]:
-    """``NAME=KIND:NUMBERS``, as on the command line."""
+    """Return ``NAME=KIND:NUMBERS``, as on the command line."""
     name, _, told = text.partition("=")
     kind, *numbers = told.split(":")
     try:
@@ -181,7 +181,7 @@ def parse(text: str) -> tuple[str, Distribution]:
 
 
 def within(name: str, whole: Distribution, low: float, high: float) -> Distribution:
-    """A distribution over the range that a vademecum holds.
+    """Return a distribution over the range that a vademecum holds.
 
     Raises
     ------
@@ -239,7 +239,7 @@ def read_distributions(file: Path) -> dict[str, Distribution]:
 
 
 def of_mappings(told: Mapping[Any, Any], origin: str) -> dict[str, Distribution]:
-    """Distributions by name of the parameter, of what a file of them consists of.
+    """Return the distributions by name of the parameter, of what a file of them consists of.
 
     Raises
     ------
@@ -250,7 +250,7 @@ def of_mappings(told: Mapping[Any, Any], origin: str) -> dict[str, Distribution]
 
 
 def mappings(known: Mapping[str, Distribution]) -> dict[str, dict[str, Any]]:
-    """The inverse of :func:`of_mappings`, of distributions that are not cut off."""
+    """Return the inverse of :func:`of_mappings`, of distributions that are not cut off."""
     found = {}
     for name, one in known.items():
         kind = next(kind for kind, made in _KINDS.items() if isinstance(one, made))

@@ -34,7 +34,7 @@ _IMITATED = 0.1  # |h| over |g|, below which the parameters make up for all
 def chance(
     deviations: FloatArray, places: FloatArray, derivatives: FloatArray, freedom: float
 ) -> float:
-    """Probability that a fit is as bad as this by chance, by the test that it passes worse.
+    """Return probability that a fit is as bad as this by chance, by the test that it passes worse.
 
     Parameters
     ----------
@@ -50,13 +50,13 @@ def chance(
 
 
 def normal_scores(deviations: FloatArray, freedom: float) -> FloatArray:
-    """s = Phi^-1(T(d)), which keeps signs, shape (n,)."""
+    """Return s = Phi^-1(T(d)), which keeps signs, shape (n,)."""
     lower = ndtri(student_t.cdf(-np.abs(deviations), freedom))
     return np.asarray(-np.sign(deviations) * lower)
 
 
 def local_chance(scores: FloatArray, places: FloatArray, derivatives: FloatArray) -> float:
-    """Probability that drawn scores deviate as much around a place as these, (n,)."""
+    """Return the probability that drawn scores deviate as much around a place as these, (n,)."""
     shapes = _shapes(places, derivatives)
     if len(shapes) == 0:
         return 1.0
@@ -67,7 +67,7 @@ def local_chance(scores: FloatArray, places: FloatArray, derivatives: FloatArray
 
 
 def _shapes(places: FloatArray, derivatives: FloatArray) -> FloatArray:
-    """h / |h| around each touch for each reach, shape (n_shapes, n)."""
+    """Return h / |h| around each touch for each reach, shape (n_shapes, n)."""
     square = ((places[:, None] - places) ** 2).sum(axis=-1)
     around = np.concatenate([np.exp(-square / reach**2) for reach in REACHES])
     basis = np.linalg.svd(derivatives, full_matrices=False)[0]

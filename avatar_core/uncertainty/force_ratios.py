@@ -54,12 +54,14 @@ def log_edges(
     draws: int = DRAWS,
     seed: int = 0,
 ) -> FloatArray:
-    """ln of the forces that 5 and 95 % of the draws stay below.
+    """Return ln of the forces that 5 and 95 % of the draws stay below.
 
     Parameters
     ----------
-    vademecum : Vademecum, at whatever values
-    known : of all its parameters, by :func:`avatar_core.uncertainty.known.known_of`
+    vademecum : Vademecum
+        Vademecum at whatever values.
+    known : Mapping[str, Distribution]
+        Known of all its parameters, by :func:`avatar_core.uncertainty.known.known_of`.
 
     Returns
     -------
@@ -86,7 +88,7 @@ def log_edges(
 def force_spread_at(
     vademecum: Vademecum, tip: Tip, known: Mapping[str, Distribution], points: np.ndarray
 ) -> FloatArray:
-    """Half of the band that holds 90 % of the force, over its middle, shape (n,).
+    """Return the half of the band that holds 90 % of the force, over its middle, shape (n,).
 
         (F_95 - F_5) / (F_95 + F_5)
 
@@ -94,8 +96,10 @@ def force_spread_at(
 
     Parameters
     ----------
-    known : of all parameters of the vademecum, by :func:`avatar_core.uncertainty.known.known_of`
-    points : ndarray, shape (n, 3), of the surface at rest [m]
+    known : Mapping[str, Distribution]
+        Known of all parameters of the vademecum, by :func:`avatar_core.uncertainty.known.known_of`.
+    points : ndarray, shape (n, 3)
+        Points of the surface at rest [m].
     """
     edges = log_edges(vademecum, (tip,), known)[0, :, 1]
     positions, weights = closest_weights(vademecum.surface, np.ascontiguousarray(points, float))
@@ -117,7 +121,7 @@ def _at(
     values: Mapping[str, float],
     young: float,
 ) -> FloatArray:
-    """The same at values of all coordinates, and a Young's modulus [Pa]."""
+    """Return the same at values of all coordinates, and a Young's modulus [Pa]."""
     poisson = values.get("poisson", vademecum.material.poisson_ratio)
     compliance = own_compliance_at(vademecum, values)
     material = Material(young_modulus=young, poisson_ratio=poisson)
@@ -129,7 +133,8 @@ def _constant(
     coordinate: Coordinate, known: Mapping[str, Distribution], young: float
 ) -> float | None:
     """The value of a coordinate that is known, at the Young's modulus of the points [Pa]; None if
-    it varies. The stiffness of a support varies with Young's modulus, over which it counts."""
+    it varies. The stiffness of a support varies with Young's modulus, over which it counts.
+    """
     one, modulus = known[coordinate.name], known["young"]
     if not isinstance(one, Fixed):
         return None
@@ -168,7 +173,7 @@ def _pressed(
     material: Material,
     contrast: float | None,
 ) -> FloatArray:
-    """Forces on a tip at ``DEPTHS``, (n_positions, n_depths) [N]; gamma is that of E too."""
+    """Return forces on a tip at ``DEPTHS``, (n_positions, n_depths) [N]; gamma is that of E too."""
     law = _law(tip)
     if law is None:
         return np.asarray(DEPTHS / gamma[:, None])
@@ -186,7 +191,7 @@ def _pressed(
 
 
 def _law(tip: Tip) -> tuple[ArrayTable, ArrayTable] | None:
-    """The law of an upright tip, as the model and the data of no organ; None of a patch."""
+    """Return the law of an upright tip, as the model and the data of no organ; None of a patch."""
     law = law_arrays((tip,), Material(), np.zeros((2, 0, 0, 0), np.float32))
     if law is None:
         return None
@@ -209,7 +214,7 @@ def _shape_factors(vademecum: Vademecum, tips: Sequence[Tip]) -> FloatArray:
 
 
 def _tumour_under(vademecum: Vademecum, tip: Tip) -> FloatArray:
-    """f where a tip touches each load position, (n_positions,)."""
+    """Return f where a tip touches each load position, (n_positions,)."""
     field, surface = vademecum.tip_field, vademecum.surface
     at = surface.centers + tip.offset * surface.normals
     grid = ((at - field.origin) / field.spacing[0]).T

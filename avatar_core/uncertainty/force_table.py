@@ -31,8 +31,12 @@ _STEP = 2e-3  # in which it comes down, at most: it must not be taken for one th
 class ForceTable:
     """Forces and displacements at the points of a grid of materials.
 
-    log_force : ndarray, shape (n_points, n_places, n_depths), ln of the force [N]
-    log_moved : ndarray of that shape, ln of the displacement of the target [m]
+    Attributes
+    ----------
+    log_force : ndarray, shape (n_points, n_places, n_depths)
+        Ln of the force [N].
+    log_moved : ndarray of that
+        Shape, ln of the displacement of the target [m].
     """
 
     grid: MaterialGrid
@@ -46,7 +50,7 @@ class ForceTable:
         return np.asarray(np.exp(found + softer[:, None, None]))
 
     def moved(self, values: Mapping[str, FloatArray]) -> FloatArray:
-        """Displacement of the target at these values, of that shape [m]; it knows no E."""
+        """Return displacement of the target at these values, of that shape [m]; it knows no E."""
         return np.asarray(np.exp(np.tensordot(self.grid.weights(values), self.log_moved, 1)))
 
 
@@ -58,13 +62,16 @@ def force_table(
     target: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> ForceTable:
-    """Press at load positions, at every point of the coordinates.
+    """Return the press at load positions, at every point of the coordinates.
 
     Parameters
     ----------
-    places : load positions
-    depths : rising, of the tip below the surface [m]
-    target : vertex whose displacement is asked for
+    places : Sequence[int]
+        Load positions.
+    depths : Sequence[float]
+        Rising, of the tip below the surface [m].
+    target : int
+        Vertex whose displacement is asked for.
 
     Raises
     ------
@@ -90,7 +97,7 @@ def _pressed(
     places: Sequence[int],
     depths: Sequence[float],
 ) -> FloatArray:
-    """Forces on a tip that is pressed along the normal, (n_places, n_depths) [N]."""
+    """Return the forces on a tip that is pressed along the normal, (n_places, n_depths) [N]."""
     data, force = model.data(), np.empty((len(places), len(depths)))
     for i, j in enumerate(places):
         data.reset()

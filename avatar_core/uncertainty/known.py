@@ -1,5 +1,6 @@
 """What is known of all parameters of a vademecum: what is given, for the rest its own values, or
-anything within its ranges."""
+anything within its ranges.
+"""
 
 from __future__ import annotations
 
@@ -26,10 +27,16 @@ YOUNG = LogUniform(500.0, 350e3)
 class Held:
     """The parameters that a vademecum holds; small enough to be sent along.
 
-    own : its values, by name of a parameter [SI]
-    coordinates : with their ranges
-    reference : Young's modulus for which the ranges of supports are stated [Pa]
-    fixed : supports that are no coordinates, and fix Young's modulus with them
+    Attributes
+    ----------
+    own : dict[str, float]
+        Its values, by name of a parameter [SI].
+    coordinates : tuple[Coordinate, ...]
+        Coordinates with their ranges.
+    reference : float
+        Young's modulus for which the ranges of supports are stated [Pa].
+    fixed : tuple[str, ...]
+        Supports that are no coordinates, and fix Young's modulus with them.
     """
 
     own: dict[str, float]
@@ -62,7 +69,7 @@ class Held:
 
     @staticmethod
     def of_plain(stored: Mapping[str, Any]) -> Held:
-        """The inverse of :meth:`plain`."""
+        """Return the inverse of :meth:`plain`."""
         return of_plain(Held, stored, "held")
 
     def known(self, given: Mapping[str, Distribution]) -> dict[str, Distribution]:
@@ -102,14 +109,14 @@ class Held:
 
 
 def known_of(vademecum: Vademecum, given: Mapping[str, Distribution]) -> dict[str, Distribution]:
-    """:meth:`Held.known` of a vademecum."""
+    """Return :meth:`Held.known` of a vademecum."""
     return Held.by(vademecum).known(given)
 
 
 def priors_of(
     vademecum: Vademecum, given: Mapping[str, Distribution] | None = None
 ) -> dict[str, Distribution]:
-    """A distribution of every coordinate and of "young": as given, or as wide as may be.
+    """Return a distribution of every coordinate and of "young": as given, or as wide as may be.
 
     A coordinate lies anywhere in its range; Young's modulus in ``YOUNG``, unless a support that is
     no coordinate fixes it.

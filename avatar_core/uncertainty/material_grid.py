@@ -32,9 +32,14 @@ _FEWER, _LEAST = {3: 4}, 3  # for each of three, of more
 class MaterialGrid:
     """Chebyshev's points of coordinates of a vademecum.
 
-    coordinates : all of the vademecum, or some
-    young : Young's modulus at the points, E0 [Pa]
-    n_each : points for each coordinate
+    Attributes
+    ----------
+    coordinates : tuple[Coordinate, ...]
+        All of the vademecum, or some.
+    young : float
+        Young's modulus at the points, E0 [Pa].
+    n_each : int
+        Points for each coordinate.
     """
 
     coordinates: tuple[Coordinate, ...]
@@ -43,7 +48,7 @@ class MaterialGrid:
 
     @classmethod
     def of(cls, vademecum: Vademecum) -> MaterialGrid:
-        """The grid of a vademecum; its fineness follows from the number of coordinates."""
+        """Return the grid of a vademecum; its fineness follows from the number of coordinates."""
         parametric = vademecum.parametric
         if parametric is None:
             return cls((), vademecum.material.young_modulus, 1)
@@ -58,20 +63,20 @@ class MaterialGrid:
         return self.n_each ** len(self.coordinates)
 
     def points(self) -> list[dict[str, float]]:
-        """Values of the coordinates, by name, at every point."""
+        """Return the values of the coordinates, by name, at every point."""
         fractions = chebyshev_points(self.n_each)
         grids = product(*([c.value_at(t) for t in fractions] for c in self.coordinates))
         names = [c.name for c in self.coordinates]
         return [dict(zip(names, point, strict=True)) for point in grids]
 
     def materials(self, vademecum: Vademecum) -> Iterator[Vademecum]:
-        """The vademecum at every point, some tenths of a second each."""
+        """Yield the vademecum at every point, some tenths of a second each."""
         reference = {"young": self.young} if self.coordinates else {}
         for point in self.points():
             yield at_values(vademecum, reference | point)
 
     def softer(self, values: Mapping[str, FloatArray]) -> FloatArray:
-        """E / E0 at values of "young", shape (n,)."""
+        """Return E / E0 at values of "young", shape (n,)."""
         return np.asarray(values["young"]) / self.young
 
     def weights(self, values: Mapping[str, FloatArray]) -> FloatArray:
@@ -87,7 +92,7 @@ class MaterialGrid:
 
 
 def chebyshev_points(n: int) -> FloatArray:
-    """Chebyshev's points of the first kind on 0 to 1, ascending, shape (n,)."""
+    """Return Chebyshev's points of the first kind on 0 to 1, ascending, shape (n,)."""
     angles = np.pi * (np.arange(n) + 0.5) / n
     return np.asarray(0.5 - 0.5 * np.cos(angles))
 

@@ -25,10 +25,14 @@ _STEP = 1e-3  # between the points of a way [m]
 class Palpation:
     """Paths of a tip, touch after touch, and the forces that were measured on them.
 
-    tip : ndarray, shape (n, 3), as a contact model takes it, each touch from outside of the organ
-        to its largest force [m]
-    touch : ndarray of int, shape (n,), the number of the touch, ascending
-    force : ndarray, shape (n,), measured size of the force [N]; NaN on the way between samples
+    Attributes
+    ----------
+    tip : ndarray, shape (n, 3)
+        As a contact model takes it, each touch from outside of the organ to its largest force [m].
+    touch : ndarray of int, shape (n,)
+        The number of the touch, ascending.
+    force : ndarray, shape (n,)
+        Measured size of the force [N]; NaN on the way between samples.
     """
 
     tip: FloatArray
@@ -53,13 +57,16 @@ class Palpation:
 
 
 def palpation_of(tip: FloatArray, force: FloatArray, least: float = LEAST_FORCE) -> Palpation:
-    """The touches of a path.
+    """Return the touches of a path.
 
     Parameters
     ----------
-    tip : ndarray, shape (n, 3), in the order of time [m]; not finite where it is not known
-    force : ndarray, shape (n,), size of the measured force at the same times [N]
-    least : force from which the organ is touched [N]
+    tip : ndarray, shape (n, 3)
+        Tip in the order of time [m]; not finite where it is not known.
+    force : ndarray, shape (n,)
+        Size of the measured force at the same times [N].
+    least : float
+        Force from which the organ is touched [N].
 
     Raises
     ------
@@ -84,7 +91,7 @@ def palpation_of(tip: FloatArray, force: FloatArray, least: float = LEAST_FORCE)
 
 
 def _touches(force: FloatArray, least: float) -> list[tuple[int, int]]:
-    """First period of each touch and the one after its last."""
+    """Return the first period of each touch and the one after its last."""
     found, start = [], -1
     for k, value in enumerate(force):
         if start < 0 and value >= least:
@@ -96,7 +103,7 @@ def _touches(force: FloatArray, least: float) -> list[tuple[int, int]]:
 
 
 def _samples(force: FloatArray, first: int, peak: int, least: float) -> IntArray:
-    """Periods of a touch at which the force first reaches equal parts of the largest."""
+    """Return the periods of a touch at which the force first reaches equal parts of the largest."""
     levels = force[peak] * (1.0 + np.arange(N_SAMPLES)) / N_SAMPLES
     loading = np.maximum.accumulate(force[first : peak + 1])
     reached = first + np.searchsorted(loading, levels[levels >= least])
@@ -106,7 +113,7 @@ def _samples(force: FloatArray, first: int, peak: int, least: float) -> IntArray
 def _way(
     tip: FloatArray, force: FloatArray, first: int, samples: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """The path from outside through the samples, and the force at these."""
+    """Return the path from outside through the samples, and the force at these."""
     last = int(samples[-1])
     travel = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(tip[: last + 1], axis=0), axis=1))]
     start = int(np.searchsorted(travel, travel[first] - _WAY_IN))

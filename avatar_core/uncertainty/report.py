@@ -21,7 +21,7 @@ UNITS = {"young": " Pa"}
 def rows(
     centers: FloatArray, depths: Sequence[float], bands: Bands
 ) -> list[dict[str, float | list[float]]]:
-    """One for each place and depth, in SI units."""
+    """Return one for each place and depth, in SI units."""
     found: list[dict[str, float | list[float]]] = []
     for i, center in enumerate(centers):
         for k, depth in enumerate(depths):

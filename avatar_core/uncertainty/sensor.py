@@ -44,9 +44,14 @@ _PAUSE = 0.1  # for which a sample stands, at most [s]
 class Sensed:
     """Forces on a path as a sensor with the right zero and no lag would have measured them.
 
-    size : ndarray, shape (n,) [N]; NaN where it is not known
-    lost : part of the work of the way in that the way out does not give back
-    notices : what was corrected, one line each
+    Attributes
+    ----------
+    size : ndarray, shape (n,)
+        Size [N]; NaN where it is not known.
+    lost : float
+        Part of the work of the way in that the way out does not give back.
+    notices : tuple[str, ...]
+        What was corrected, one line each.
     """
 
     size: FloatArray
@@ -61,9 +66,12 @@ def sensed(
 
     Parameters
     ----------
-    time : ndarray, shape (n,), rising [s]
-    position : ndarray, shape (n, 3), of the tip [m]; not finite where it is not known
-    force : ndarray, shape (n, 3), in any axes that turn with the sensor or not at all [N]
+    time : ndarray, shape (n,)
+        Rising [s].
+    position : ndarray, shape (n, 3)
+        Position of the tip [m]; not finite where it is not known.
+    force : ndarray, shape (n, 3)
+        Force in any axes that turn with the sensor or not at all [N].
 
     Raises
     ------
@@ -116,7 +124,7 @@ def _followed(
 
 
 def _lag(time: FloatArray, size: FloatArray, expected: FloatArray) -> float:
-    """Time by which forces follow those expected [s]; negative where they run ahead."""
+    """Return the time by which forces follow those expected [s]; negative where they run ahead."""
     weight = expected * np.minimum(np.gradient(time), _PAUSE)
 
     def overlap(lag: float) -> float:
@@ -132,7 +140,7 @@ def _lag(time: FloatArray, size: FloatArray, expected: FloatArray) -> float:
 
 
 def _lost(size: FloatArray, expected: FloatArray) -> float:
-    """Part of the work of the way in that the way out does not give back, 0 to 1."""
+    """Return the part of the work of the way in that the way out does not give back, 0 to 1."""
     known = np.isfinite(size)
     middle = 0.5 * (size[known][1:] + size[known][:-1])
     work = middle * np.diff(expected[known])

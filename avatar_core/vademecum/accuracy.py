@@ -27,9 +27,13 @@ _CONFIDENCE = 0.95  # that it does, over draws of the loads that were measured
 class Detail:
     """How finely a step shows the displacement.
 
-    modes : that move a point, in the mean over the points of the cloud, of those that the place's
-        region and its share of the global ones leave there; a vademecum's ``n_modes`` show all
-    cloud : vertices that are shown
+    Attributes
+    ----------
+    modes : int
+        Modes that move a point, in the mean over the points of the cloud, of those that the place's
+        region and its share of the global ones leave there; a vademecum's ``n_modes`` show all.
+    cloud : Cloud
+        Vertices that are shown.
     """
 
     modes: int
@@ -40,7 +44,7 @@ class Detail:
 
 
 def mode_levels(n_modes: int) -> tuple[int, ...]:
-    """Numbers of modes of the details of a curve, ascending, all at the end."""
+    """Return the numbers of modes of the details of a curve, ascending, all at the end."""
     return (*(level for level in LEVELS if level < n_modes), n_modes)
 
 
@@ -48,11 +52,16 @@ def mode_levels(n_modes: int) -> tuple[int, ...]:
 class CurvePoint:
     """Measured error, size and time of a detail.
 
-    l2, force : relative error that 95 % of unseen contacts stay below, of the displacement of the
-        cloud under the force that is felt, and of that force at the tip's depth; l2 is NaN where
-        nothing is shown
-    p50, p99 : time that a step takes of the processor [s]; NaN where it was not timed
-    nbytes : of all that is held to show the displacement; a step reads a part
+    Attributes
+    ----------
+    l2, force : float
+        Relative error that 95 % of unseen contacts stay below, of the displacement of the cloud
+        under the force that is felt, and of that force at the tip's depth; l2 is NaN where nothing
+        is shown.
+    p50, p99 : float
+        Time that a step takes of the processor [s]; NaN where it was not timed.
+    nbytes : int
+        Nbytes of all that is held to show the displacement; a step reads a part.
     """
 
     detail: Detail
@@ -63,7 +72,7 @@ class CurvePoint:
     p99: float = float("nan")
 
     def error(self, quantity: Quantity) -> float:
-        """The certified error of a quantity."""
+        """Return the certified error of a quantity."""
         return self.l2 if quantity == "l2" else self.force
 
 
@@ -103,7 +112,12 @@ class Budget:
 class AccuracyCurve:
     """Measured error and time of many details of one vademecum.
 
-    n_errors : unseen contacts behind each error; machine : where it was timed
+    Attributes
+    ----------
+    n_errors : int
+        Unseen contacts behind each error.
+    machine : str
+        Machine where it was timed.
     """
 
     points: tuple[CurvePoint, ...]
@@ -111,16 +125,16 @@ class AccuracyCurve:
     machine: str = ""
 
     def of(self, cloud: Cloud) -> AccuracyCurve:
-        """The points of one cloud, of fewest modes first."""
+        """Return the points of one cloud, of fewest modes first."""
         some = (point for point in self.points if point.detail.cloud == cloud)
         return replace(self, points=tuple(sorted(some, key=lambda p: p.detail.modes)))
 
     def up_to(self, modes: int) -> AccuracyCurve:
-        """The points of at most so many modes."""
+        """Return the points of at most so many modes."""
         return replace(self, points=tuple(p for p in self.points if p.detail.modes <= modes))
 
     def front(self, quantity: Quantity = "l2") -> tuple[CurvePoint, ...]:
-        """Points that none other beats in time and error (Pareto), fastest first."""
+        """Return the points that none other beats in time and error (Pareto), fastest first."""
         best, front = np.inf, []
         for point in sorted(self.points, key=lambda p: (p.p50, p.error(quantity))):
             if point.error(quantity) < best:
@@ -139,7 +153,7 @@ class AccuracyCurve:
 
     @staticmethod
     def of_plain(stored: dict[str, Any]) -> AccuracyCurve:
-        """The inverse of :meth:`plain`."""
+        """Return the inverse of :meth:`plain`."""
 
         def rows(names: tuple[str, ...]) -> Iterable[tuple[Any, ...]]:
             return zip(*(stored[name] for name in names), strict=True)
@@ -154,7 +168,7 @@ def _names(kind: type) -> tuple[str, ...]:
 
 
 def choose(curve: AccuracyCurve | None, budget: Budget) -> CurvePoint:
-    """The fastest point that meets a budget; of equally fast ones the most accurate.
+    """Return the fastest point that meets a budget; of equally fast ones the most accurate.
 
     On a curve that was not timed, the fewest modes are the fastest. A looser tolerance is therefore
     never slower, and a longer deadline never changes what is chosen, unless nothing met the shorter
@@ -205,7 +219,7 @@ def _first(
 
 
 def upper_quantile(values: np.ndarray, content: float = CONTENT) -> float:
-    """A bound that holds for a part ``content`` of what the values (n,) were drawn from.
+    """Return a bound that holds for a part ``content`` of what the values (n,) were drawn from.
 
     Distribution-free tolerance bound (Wilks, Annals of Mathematical Statistics 12, 1941): the
     smallest order statistic x_(r) with P[B >= r] <= 1 - confidence, B binomial of n and

@@ -110,7 +110,8 @@ def own_compliance_at(vademecum: Vademecum, values: Mapping[str, float]) -> np.n
 
     Parameters
     ----------
-    values : of all coordinates, by name; within their ranges
+    values : Mapping[str, float]
+        Values of all coordinates, by name; within their ranges.
     """
     parametric, near = vademecum.parametric, vademecum.contact_near
     own = np.flatnonzero(near.position == near.target)
@@ -130,19 +131,19 @@ def own_compliance_at(vademecum: Vademecum, values: Mapping[str, float]) -> np.n
 
 
 def own_compliance(vademecum: Vademecum) -> np.ndarray:
-    """The same of a vademecum at the values that it has, (n_positions, 3, 3) [m/N]."""
+    """Return the same of a vademecum at the values that it has, (n_positions, 3, 3) [m/N]."""
     near = vademecum.contact_near
     return _own_compliance(vademecum.contact_load, near.block[near.position == near.target])
 
 
 def _own_compliance(load: np.ndarray, block: np.ndarray) -> np.ndarray:
-    """Y_j Y_j^T + the near block of j with itself."""
+    """Return Y_j Y_j^T + the near block of j with itself."""
     rows = load.reshape(len(block), 3, -1)
     return np.asarray(rows @ rows.swapaxes(1, 2) + block)
 
 
 def ranges(vademecum: Vademecum) -> dict[str, tuple[float, float]]:
-    """Lowest and highest value of each coordinate, by name, if no other is changed.
+    """Return the lowest and highest value of each coordinate, by name, if no other is changed.
 
     "young" is among them only where supports limit it.
     """

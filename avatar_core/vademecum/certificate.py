@@ -17,12 +17,19 @@ class ContactSites:
     The contacts are those of spheres of several radii at several depths at some places of the
     organ; :mod:`avatar_core.certify.contact_sites`.
 
-    n_contacts, n_places : resolved; 0: not asked for
-    mean, p95, worst : |F / F_resolved - 1| along the normal; p95 is that which 5 % exceed
-    coverage : part of the contacts whose error is at most the one that the step says
-    overestimate : median of the error that is said over the true one
-    factor : by which the law's part of the error that is said is multiplied, so that these contacts
-        are covered; 1 where there are none
+    Attributes
+    ----------
+    n_contacts, n_places : int
+        Resolved; 0: not asked for.
+    mean, p95, worst : float
+        |F / F_resolved - 1| along the normal; p95 is that which 5 % exceed.
+    coverage : float
+        Part of the contacts whose error is at most the one that the step says.
+    overestimate : float
+        Median of the error that is said over the true one.
+    factor : float
+        By which the law's part of the error that is said is multiplied, so that these contacts are
+        covered; 1 where there are none.
     """
 
     n_contacts: int = 0

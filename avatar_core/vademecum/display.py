@@ -38,13 +38,20 @@ Triangles = tuple[np.ndarray, np.ndarray]  # vertices (n, 3) [m], faces (m, 3)
 class Display:
     """Displayed triangles at rest, part by part, and how they hang on the mesh.
 
-    vertices : ndarray, shape (n, 3) float32 [m]
-    faces : ndarray of int32, shape (m, 3), counter-clockwise seen from outside
-    corners : ndarray of int32, shape (n, 4), vertices of the mesh that carry each vertex
-    weights : ndarray, shape (n, 4) float32, of the corners; they add up to 1
-    first_face : ndarray of int64, shape (n_parts + 1,), of each part; vertices likewise follow each
-        other
-    names : of the parts; the first is the organ's surface
+    Attributes
+    ----------
+    vertices : ndarray, shape (n, 3)
+        float32 [m].
+    faces : ndarray of int32, shape (m, 3)
+        Counter-clockwise seen from outside.
+    corners : ndarray of int32, shape (n, 4)
+        Vertices of the mesh that carry each vertex.
+    weights : ndarray, shape (n, 4)
+        float32, of the corners; they add up to 1.
+    first_face : ndarray of int64, shape (n_parts + 1,)
+        First face of each part; vertices likewise follow each other.
+    names : tuple[str, ...]
+        Names of the parts; the first is the organ's surface.
     """
 
     vertices: np.ndarray
@@ -55,18 +62,23 @@ class Display:
     names: tuple[str, ...]
 
     def faces_of(self, part: int) -> np.ndarray:
-        """The triangles of a part, over all displayed vertices."""
+        """Return the triangles of a part, over all displayed vertices."""
         return self.faces[self.first_face[part] : self.first_face[part + 1]]
 
 
 def organ_display(
     mesh: TetMesh, surface: SurfaceMesh | None, n: int, inside: Sequence[SurfaceMesh] = ()
 ) -> Display | None:
-    """Displayed triangles of an organ; None if they are the boundary of its mesh alone.
+    """Return the displayed triangles of an organ; None if they are the boundary of its mesh alone.
 
-    surface : that the mesh was made of; None for the mesh's own boundary, refined
-    n : vertices, about; 0 for those of the mesh
-    inside : structures
+    Parameters
+    ----------
+    surface : SurfaceMesh or None
+        Surface that the mesh was made of; None for the mesh's own boundary, refined.
+    n : int
+        Vertices, about; 0 for those of the mesh.
+    inside : Sequence[SurfaceMesh]
+        Structures.
     """
     if n == 0 and not inside:
         return None
@@ -77,7 +89,7 @@ def organ_display(
 def display_of(
     mesh: TetMesh, organ: Triangles, structures: Sequence[tuple[str, Triangles]] = ()
 ) -> Display:
-    """The organ's surface and named structures inside, tied to a mesh."""
+    """Return the organ's surface and named structures inside, tied to a mesh."""
     inside = [triangles for _, triangles in structures]
     tied = [_on_boundary(mesh, organ[0]), *(carriers(mesh, points) for points, _ in inside)]
     parts = [organ, *inside]
@@ -102,7 +114,7 @@ def _on_boundary(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def blocks_to_display(mesh: TetMesh, display: Display | None) -> Blocks:
-    """The vertices of a mesh in blocks, of which the first hold what a display needs."""
+    """Return the vertices of a mesh in blocks, of which the first hold what a display needs."""
     return blocks_of(mesh.vertices, displayed_vertices(mesh, display))
 
 
@@ -114,13 +126,13 @@ def displayed_vertices(mesh: TetMesh, display: Display | None) -> np.ndarray:
 
 
 def boundary(mesh: TetMesh) -> Triangles:
-    """The mesh's own surface."""
+    """Return the mesh's own surface."""
     index = mesh.surface_vertices
     return mesh.vertices[index], np.searchsorted(index, mesh.boundary_faces)
 
 
 def outline(mesh: TetMesh, surface: SurfaceMesh | None, n: int) -> Triangles:
-    """The surface that a mesh was made of, with about n vertices.
+    """Return the surface that a mesh was made of, with about n vertices.
 
     Without one, and where triangles of the file cross or do not close, the boundary of the mesh is
     refined instead.
@@ -132,7 +144,7 @@ def outline(mesh: TetMesh, surface: SurfaceMesh | None, n: int) -> Triangles:
 
 
 def structure(surface: SurfaceMesh) -> Triangles:
-    """A smooth surface inside an organ, such as that of a tumour, of the same volume.
+    """Return a smooth surface inside an organ, such as that of a tumour, of the same volume.
 
     A label map gives a lesion some hundred triangles; their edges would be seen.
     """

@@ -30,12 +30,14 @@ class ForceError:
     floor: float = float("nan")
 
     def relative(self, smoothing: np.ndarray, bending: float = 0.0) -> np.ndarray:
-        """Relative error that one contact in ten may exceed.
+        """Return the relative error that one contact in ten may exceed.
 
         Parameters
         ----------
-        smoothing : relative change of the compliance by smoothing, any shape
-        bending : mean relative error that large deformation adds
+        smoothing : ndarray
+            Relative change of the compliance by smoothing, any shape.
+        bending : float
+            Mean relative error that large deformation adds.
         """
         own = self.factor * (np.asarray(smoothing) + self.floor)
         return np.asarray(own + _WORST_OVER_MEAN * bending, np.float32)

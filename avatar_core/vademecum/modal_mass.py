@@ -35,8 +35,12 @@ _EIGEN_TOLERANCE = 1e-6  # of the slowest vibrations
 class BodyResponse:
     """Mass and weight of the organ, projected onto K-orthonormal modes X.
 
-    mass : ndarray, shape (rank, rank), X^T M X for a unit density [s^2 m^3 / kg]
-    weight : ndarray, shape (rank, 3), X^T M e_d, a uniform body force on each mode [m^3.5 ...]
+    Attributes
+    ----------
+    mass : ndarray, shape (rank, rank)
+        X^T M X for a unit density [s^2 m^3 / kg].
+    weight : ndarray, shape (rank, 3)
+        X^T M e_d, a uniform body force on each mode [m^3.5 ...].
     """
 
     mass: np.ndarray
@@ -103,7 +107,7 @@ def principal_sags(sags: np.ndarray) -> np.ndarray:
 
 
 def motion_beside(load: np.ndarray, body: BodyResponse | None) -> np.ndarray:
-    """Amplitudes by which global modes may move beside the loads of the moment, (n, rank).
+    """Return amplitudes by which global modes may move beside the loads of the moment, (n, rank).
 
     A history may leave those of any load (3 n_positions, rank); each axis of the organ's weight
     counts as much as all loads together.
@@ -143,13 +147,16 @@ def _vibrations(elasticity: Elasticity, mass: sp.csr_matrix) -> tuple[np.ndarray
 
 
 def completed(body: BodyResponse, sags: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Columns that add the body's functions to some modes of a K-orthonormal basis.
+    """Return the columns that add the body's functions to some modes of a K-orthonormal basis.
 
     Parameters
     ----------
-    body : of the basis, n functions
-    sags : ndarray, shape (n, n_sags), of the organ under its weight
-    kept : ndarray, shape (n, rank), orthonormal
+    body : BodyResponse
+        Body of the basis, n functions.
+    sags : ndarray, shape (n, n_sags)
+        Sags of the organ under its weight.
+    kept : ndarray, shape (n, rank)
+        Orthonormal.
 
     Returns
     -------

@@ -39,11 +39,18 @@ from avatar_core.vademecum.tip_field import TipField
 class Provenance:
     """Where a vademecum comes from: enough to build it again.
 
-    source : file name of the surface, ``source_sha256`` its hash
-    unit, axes : as applied at the door
-    versions : "package version" of everything that took part
-    parameters : "name=value" of the build
-    notices : of the reader of the surface and of the build
+    Attributes
+    ----------
+    source : str
+        File name of the surface, ``source_sha256`` its hash.
+    unit, axes : str
+        As applied at the door.
+    versions : tuple[str, ...]
+        "package version" of everything that took part.
+    parameters : tuple[str, ...]
+        "name=value" of the build.
+    notices : tuple[str, ...]
+        Notices of the reader of the surface and of the build.
     """
 
     source: str
@@ -68,12 +75,19 @@ class RankError:
 class Convergence:
     """How the modes were found.
 
-    converged : the tolerance was met within the mode limit
-    tolerance : asked for, mean relative L2 error over the build's own loads
-    enrichments : one report each
-    rank_errors : error against number of modes at a place
-    every_mean, every_worst : relative L2 error of the field under every load of the build, in three
-        directions at each position; NaN of a patient whose loads are not all solved
+    Attributes
+    ----------
+    converged : bool
+        The tolerance was met within the mode limit.
+    tolerance : float
+        Asked for, mean relative L2 error over the build's own loads.
+    enrichments : tuple[EnrichmentReport, ...]
+        One report each.
+    rank_errors : tuple[RankError, ...]
+        Error against number of modes at a place.
+    every_mean, every_worst : float
+        Relative L2 error of the field under every load of the build, in three directions at each
+        position; NaN of a patient whose loads are not all solved.
     """
 
     converged: bool
@@ -84,7 +98,7 @@ class Convergence:
     every_worst: float = float("nan")
 
     def with_errors(self, errors: np.ndarray) -> Convergence:
-        """The same with the errors of the field, any shape."""
+        """Return the same with the errors of the field, any shape."""
         return replace(self, every_mean=float(errors.mean()), every_worst=float(errors.max()))
 
 
@@ -92,7 +106,10 @@ class Convergence:
 class VademecumInfo:
     """Summary of a vademecum; the fields of avatar_ros/msg/VademecumInfo.
 
-    force_mean, force_worst : relative error at a depth, anywhere on the surface that tips feel
+    Attributes
+    ----------
+    force_mean, force_worst : float
+        Relative error at a depth, anywhere on the surface that tips feel.
     """
 
     id: str

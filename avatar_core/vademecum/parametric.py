@@ -31,12 +31,19 @@ from avatar_core.vademecum.modal_mass import BodyResponse
 class GalerkinBasis:
     """A space basis for the whole range, and the terms of the stiffness in it.
 
-    basis : SeparatedField, V at the vertices (3 n_vertices, n) and V^T f (3 n_positions, n), the
-        functions of the body after those of the global modes
-    operators : ndarray, shape (n_terms, n, n), A_q of :attr:`Elasticity.factors`
-    n_global : global modes of a vademecum at given values; rank : of its contact compliance, these
-        among them
-    body : BodyResponse of the basis, or None
+    Attributes
+    ----------
+    basis : SeparatedField
+        V at the vertices (3 n_vertices, n) and V^T f (3 n_positions, n), the functions of the body
+        after those of the global modes.
+    operators : ndarray, shape (n_terms, n, n)
+        A_q of :attr:`Elasticity.factors`.
+    n_global : int
+        Global modes of a vademecum at given values.
+    rank : int
+        Rank of its contact compliance, these among them.
+    body : BodyResponse or None
+        BodyResponse of the basis, or None.
     """
 
     basis: SeparatedField
@@ -50,16 +57,20 @@ class GalerkinBasis:
 class ParametricResponse(GalerkinBasis):
     """The data of a vademecum's coordinates, beside its own fields.
 
-    coordinates : at least one
-    projection : ndarray, shape (n_regions, most, n), the functions of the basis in the modes of
-        each region
-    regional_load : ndarray, shape (n_nodes, n_positions, 3, most), what the basis leaves at the
-        nodes, in the modes of each position's region
-    core : ndarray, shape (n_block_modes, n_global), of the vademecum's field for the first
-        functions of the basis
-    contact_near : ndarray, shape (n_nodes, n_blocks, 3, 3), blocks at the nodes in the pattern of
-        the vademecum's own near field
-    young_modulus : that the blocks are computed for [Pa]
+    Attributes
+    ----------
+    coordinates : tuple[Coordinate, ...]
+        Coordinates at least one.
+    projection : ndarray, shape (n_regions, most, n)
+        The functions of the basis in the modes of each region.
+    regional_load : ndarray, shape (n_nodes, n_positions, 3, most)
+        What the basis leaves at the nodes, in the modes of each position's region.
+    core : ndarray, shape (n_block_modes, n_global)
+        Core of the vademecum's field for the first functions of the basis.
+    contact_near : ndarray, shape (n_nodes, n_blocks, 3, 3)
+        Blocks at the nodes in the pattern of the vademecum's own near field.
+    young_modulus : float
+        Young modulus that the blocks are computed for [Pa].
     """
 
     coordinates: tuple[Coordinate, ...]
@@ -71,7 +82,7 @@ class ParametricResponse(GalerkinBasis):
 
 
 def stiffness_root(basis: GalerkinBasis, factors: np.ndarray) -> np.ndarray:
-    """L of A(p) = L L^T for the factors theta_q(p), lower triangular, shape (n, n)."""
+    """Return L of A(p) = L L^T for the factors theta_q(p), lower triangular, shape (n, n)."""
     stiffness = np.tensordot(factors, basis.operators, axes=1)
     return np.asarray(np.linalg.cholesky((stiffness + stiffness.T) / 2.0))
 
@@ -79,7 +90,7 @@ def stiffness_root(basis: GalerkinBasis, factors: np.ndarray) -> np.ndarray:
 def galerkin_field(
     found: GalerkinBasis, root: np.ndarray
 ) -> tuple[SeparatedField, np.ndarray, BodyResponse | None]:
-    """The K(p)-orthonormal response in the space of the basis.
+    """Return the K(p)-orthonormal response in the space of the basis.
 
     L is triangular: the global modes at p span the first functions of the basis whatever p is, so
     that what they leave is a smooth function of p.
@@ -87,13 +98,17 @@ def galerkin_field(
     Parameters
     ----------
     found : GalerkinBasis
-    root : L, of :func:`stiffness_root`
+    root : ndarray
+        L, of :func:`stiffness_root`.
 
     Returns
     -------
-    far : the global modes, those of the body last
-    trailing : ndarray, shape (3 n_positions, rank - n_global), load functions of further modes
-    body : of the global modes; None for modes of surface loads alone
+    far : SeparatedField
+        The global modes, those of the body last.
+    trailing : ndarray, shape (3 n_positions, rank - n_global)
+        Load functions of further modes.
+    body : BodyResponse or None
+        Body of the global modes; None for modes of surface loads alone.
     """
     basis, body, n = found.basis, found.body, found.n_global
     load = galerkin_load(found, root)
@@ -106,7 +121,7 @@ def galerkin_field(
 
 
 def galerkin_load(found: GalerkinBasis, root: np.ndarray) -> np.ndarray:
-    """Y(s) of the contact compliance, shape (3 n_positions, rank); ``root`` as above."""
+    """Return Y(s) of the contact compliance, shape (3 n_positions, rank); ``root`` as above."""
     load = scipy.linalg.solve_triangular(root, found.basis.load.T, lower=True)
     return np.asarray(load[: found.rank].T)
 
@@ -120,9 +135,14 @@ def regional_load_of_basis(
 ) -> np.ndarray:
     """The response beyond the global modes in the regional modes, (n_positions, 3, most) [m/N].
 
-    projection : of the functions of the basis in the modes of each region
-    root, trailing : of :func:`stiffness_root` and :func:`galerkin_field`
-    region : of each load position
+    Parameters
+    ----------
+    projection : ndarray
+        Projection of the functions of the basis in the modes of each region.
+    root, trailing : ndarray
+        Root and trailing of :func:`stiffness_root` and :func:`galerkin_field`.
+    region : ndarray
+        Region of each load position.
     """
     n, rank = found.n_global, found.rank
     load = trailing.reshape(len(region), 3, rank - n).astype(np.float32)
@@ -136,10 +156,16 @@ def regional_load_of_basis(
 
 
 def field_at(field: BlockField, core: np.ndarray, root: np.ndarray, load: np.ndarray) -> BlockField:
-    """A field whose global modes are X = V L^-T at some values, of the one for V.
+    """Return a field whose global modes are X = V L^-T at some values, of the one for V.
 
-    core : of V; root : L of all functions; load : amounts of X and of the regional modes,
-        (n_positions, 3, most)
+    Parameters
+    ----------
+    core : ndarray
+        Core of V.
+    root : ndarray
+        L of all functions.
+    load : ndarray
+        Amounts of X and of the regional modes, (n_positions, 3, most).
     """
     n = core.shape[1]
     inverse = scipy.linalg.solve_triangular(root[:n, :n], np.eye(n), lower=True)
@@ -148,6 +174,6 @@ def field_at(field: BlockField, core: np.ndarray, root: np.ndarray, load: np.nda
 
 
 def combined(at_nodes: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Values between the nodes, of values at them (n_nodes, ...)."""
+    """Return the values between the nodes, of values at them (n_nodes, ...)."""
     used = np.flatnonzero(weights)
     return np.asarray(np.tensordot(weights[used].astype(np.float32), at_nodes[used], 1))

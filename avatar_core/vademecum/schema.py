@@ -121,7 +121,7 @@ _PARTS = (
 
 
 def shapes_of(held: Container[str]) -> dict[str, str]:
-    """Shapes of the arrays of a vademecum that has some keys."""
+    """Return the shapes of the arrays of a vademecum that has some keys."""
     shapes = dict(_LINEAR)
     for part in _PARTS:
         if next(iter(part)) in held:

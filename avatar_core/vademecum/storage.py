@@ -162,8 +162,10 @@ def parse_vademecum(content: bytes | memoryview, origin: str) -> Vademecum:
 
     Parameters
     ----------
-    content : the bytes of a vademecum file
-    origin : its name in messages
+    content : bytes or memoryview
+        The bytes of a vademecum file.
+    origin : str
+        Its name in messages.
     """
     if len(content) > MAX_FILE_BYTES:
         raise StorageError(f"{origin} has {len(content) >> 20} MiB, more than a vademecum may have")
@@ -171,7 +173,7 @@ def parse_vademecum(content: bytes | memoryview, origin: str) -> Vademecum:
 
 
 def is_vademecum(path: str | Path) -> bool:
-    """Whether a path is a regular HDF5 file of the format of vademecums; no more is read."""
+    """Return whether a path is a regular HDF5 file of the format of vademecums; no more is read."""
     return format_of(Path(path), MAX_FILE_BYTES) == FORMAT
 
 
@@ -186,7 +188,7 @@ def _read(source: BinaryIO, origin: str) -> Vademecum:
 
 
 def id_of(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
-    """SHA-256 of a file's content but for what a clock measured, 64 hexadecimal digits.
+    """Return SHA-256 of a file's content but for what a clock measured, 64 hexadecimal digits.
 
     Left out are ``accuracy`` and the certificate's ``build_cpu_seconds``: two builds of one
     organ differ in nothing else.
@@ -199,7 +201,7 @@ def id_of(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
 
 
 def _attributes_of(held: dict[str, str], origin: str) -> dict[str, str]:
-    """The attributes that count, of a file that is a vademecum of the present schema."""
+    """Return the attributes that count, of a file that is a vademecum of the present schema."""
     if held.get("format") != FORMAT:
         raise StorageError(f"{origin} is HDF5 but no vademecum; build one with 'avatar vademecum'")
     require_schema(held, SCHEMA_VERSION, origin, "build it again with 'avatar vademecum'")
@@ -207,7 +209,7 @@ def _attributes_of(held: dict[str, str], origin: str) -> dict[str, str]:
 
 
 def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
-    """Every dataset; the keys are attribute paths of the vademecum."""
+    """Return every dataset; the keys are attribute paths of the vademecum."""
     arrays = {}
     held = PARAMETRIC_KEYS[:1] * bool(v.parametric) + LARGE_KEYS[:1] * bool(v.large)
     held += BODY_KEYS[:1] * bool(v.body)
@@ -227,7 +229,7 @@ def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
 
 
 def _upper_half(v: Vademecum) -> dict[str, np.ndarray]:
-    """The contact near field, as it is symmetric."""
+    """Return the contact near field, as it is symmetric."""
     near, upper = v.contact_near, v.contact_near.is_upper
     count = np.bincount(near.position[upper], minlength=len(near.start) - 1)
     out = {
@@ -266,7 +268,7 @@ def _attributes(v: Vademecum) -> dict[str, str]:
 
 
 def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vademecum:
-    """The vademecum of arrays and attributes from elsewhere; all are checked first."""
+    """Return the vademecum of arrays and attributes from elsewhere; all are checked first."""
     require_sound(arrays)
     mirror = Mirror.of(arrays["contact_near/start"], arrays["contact_near/target"])
     plain = {key: parsed(attributes[key], key) for key in _JSON}

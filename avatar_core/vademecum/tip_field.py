@@ -79,9 +79,12 @@ def make_tip_field(
 
     Parameters
     ----------
-    mesh, regions : the organ
-    patch_radius : R [m]
-    outline : the surface of which the mesh was made; None for the mesh's own boundary
+    mesh, regions : TetMesh
+        The organ.
+    patch_radius : float
+        R [m].
+    outline : SurfaceMesh or None
+        The surface of which the mesh was made; None for the mesh's own boundary.
 
     Raises
     ------
@@ -109,7 +112,7 @@ def make_tip_field(
 
 
 def with_tumour(field: TipField, tumour: SurfaceMesh, patch_radius: float) -> TipField:
-    """The same with f over a tumour, of a vademecum with that patch radius [m]."""
+    """Return the same with f over a tumour, of a vademecum with that patch radius [m]."""
     spacing = float(field.spacing[0])
     known, normals = _around(field.distance, field.access)
     points = field.origin + spacing * np.argwhere(known) - field.distance[known][:, None] * normals
@@ -193,7 +196,7 @@ def _near(triangles: Soup, mesh: TetMesh, regions: Regions, fade: float) -> Soup
 
 
 def _access(mesh: TetMesh, regions: Regions, fade: float, points: np.ndarray) -> np.ndarray:
-    """chi: one where the closest face is accessible, zero at the fading distance beyond."""
+    """Return chi: one where the closest face is accessible, zero at the fading distance beyond."""
     own = (mesh.vertices, mesh.boundary_faces)
     open_part = (mesh.vertices, mesh.boundary_faces[regions.accessible])
     _, face, closest = _closest(own, points)
@@ -228,7 +231,7 @@ def _split(triangles: Soup, longest: float) -> Soup:
 
 
 def grid_normals(distance: np.ndarray, spacing: float) -> np.ndarray:
-    """grad phi / |grad phi| of the splines at the grid points, shape (nx, ny, nz, 3)."""
+    """Return grad phi / |grad phi| of the splines at the grid points, shape (nx, ny, nz, 3)."""
     slope = np.stack([_derivative(distance, axis) for axis in range(3)], axis=-1)
     slope /= spacing
     return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-3)
@@ -243,7 +246,7 @@ def _derivative(values: np.ndarray, along: int) -> np.ndarray:
 
 
 def smoothed(values: np.ndarray, deviation: float, known: np.ndarray | None = None) -> np.ndarray:
-    """2 G f - G G f on a grid, G a Gaussian of some standard deviation [grid spacings].
+    """Return 2 G f - G G f on a grid, G a Gaussian of some standard deviation [grid spacings].
 
     Where not all grid points are ``known``, their mean stands in for the others.
     """
@@ -261,6 +264,6 @@ def smoothed(values: np.ndarray, deviation: float, known: np.ndarray | None = No
 
 
 def _closest(triangles: Soup, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distance to some triangles, the closest of them, and the closest point on it."""
+    """Return the distance to some triangles, the closest of them, and the closest point on it."""
     squared, face, closest = igl.point_mesh_squared_distance(points, *triangles)
     return np.sqrt(squared), face, closest

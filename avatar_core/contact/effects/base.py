@@ -23,13 +23,22 @@ if TYPE_CHECKING:
 class Ground:
     """Ground on which an effect lays out its arrays.
 
-    vademecum : as the effects of the scene adapt it
-    tips, effects : of the scene
-    response : TipResponse of the organ, on the grid of its tip field
-    n_modes : of the contact compliance, with those of zero that fill up a row
-    reach : longest distance between the two positions of a block of the near field [m]
-    large_start : of the modes of large deformation among those of the cloud, (n_regions + 1,)
-    period : of the steps [s]
+    Attributes
+    ----------
+    vademecum : Vademecum
+        As the effects of the scene adapt it.
+    tips, effects : Sequence[Tip]
+        Tips and effects of the scene.
+    response : TipResponse
+        TipResponse of the organ, on the grid of its tip field.
+    n_modes : int
+        n modes of the contact compliance, with those of zero that fill up a row.
+    reach : float
+        Longest distance between the two positions of a block of the near field [m].
+    large_start : ndarray
+        Large start of the modes of large deformation among those of the cloud, (n_regions + 1,).
+    period : float
+        Period of the steps [s].
     """
 
     vademecum: Vademecum
@@ -46,10 +55,16 @@ class Ground:
 class Effect(ABC):
     """One physical effect with its parameters, all in SI units.
 
-    Constants : kind of the arrays that a step reads of it; None if it acts through the vademecum
-    State : kind of what it keeps between steps, and of its scratch; None if there is nothing
-    superposed : whether the displacement of a tip follows from all loads and histories together
-    moving : whether it moves the organ by more than the loads of the moment do
+    Attributes
+    ----------
+    Constants : ClassVar[Any]
+        Kind of the arrays that a step reads of it; None if it acts through the vademecum.
+    State : ClassVar[Any]
+        Kind of what it keeps between steps, and of its scratch; None if there is nothing.
+    superposed : ClassVar[bool]
+        Whether the displacement of a tip follows from all loads and histories together.
+    moving : ClassVar[bool]
+        Whether it moves the organ by more than the loads of the moment do.
 
     Raises
     ------
@@ -82,11 +97,11 @@ class Effect(ABC):
         return cls()
 
     def adapted(self, vademecum: Vademecum) -> Vademecum:
-        """The vademecum in the modes, or at the values, that the effect needs."""
+        """Return the vademecum in the modes, or at the values, that the effect needs."""
         return vademecum
 
     def lay_out(self, ground: Ground) -> Any:
-        """The arrays of ``Constants``."""
+        """Return the arrays of ``Constants``."""
         return self.Constants()
 
     @staticmethod  # noqa: B027 (most begin at zero)
@@ -98,12 +113,12 @@ _E = TypeVar("_E", bound=Effect)
 
 
 def find(effects: Sequence[Effect], kind: type[_E]) -> _E | None:
-    """The effect of a kind, if it was chosen."""
+    """Return the effect of a kind, if it was chosen."""
     return next((effect for effect in effects if isinstance(effect, kind)), None)
 
 
 def direction(values: tuple[float, ...], owner: str, key: str) -> tuple[float, float, float]:
-    """Three numbers as a unit vector; a unit vector stays the same bit by bit."""
+    """Return three numbers as a unit vector; a unit vector stays the same bit by bit."""
     largest = max(map(abs, values)) if len(values) == 3 else 0.0
     if largest == 0.0:
         raise SceneError(f"{owner}.{key} is {list(values)}; give three numbers, not all zero")

@@ -108,7 +108,7 @@ def near_between(model, data, t, s):  # type: ignore[no-untyped-def]
 
 @fast
 def force_on_tissue(model, data, t):  # type: ignore[no-untyped-def]
-    """g of a tip [N]; without friction, - lambda n."""
+    """Return g of a tip [N]; without friction, - lambda n."""
     if model.friction.on:
         g = data.friction.push[t]
         return g[0], g[1], g[2]

@@ -49,7 +49,7 @@ class SelfWeight(Effect):
         return cls(gravity=1.0)
 
     def sag(self, vademecum: Vademecum) -> np.ndarray:
-        """Amplitudes of the global modes, shape (k,), before the tissue relaxes."""
+        """Return the amplitudes of the global modes, shape (k,), before the tissue relaxes."""
         assert vademecum.body is not None  # by `require`
         force = self.density * self.gravity * np.array(self.direction)
         return np.asarray(vademecum.body.weight @ force)

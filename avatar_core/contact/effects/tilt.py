@@ -128,7 +128,8 @@ def _righting(ratio):  # type: ignore[no-untyped-def]
 @fast
 def evaluate_tilt(model, data, t, load):  # type: ignore[no-untyped-def]
     """What leaning adds to the depth of the lowest point [m], to its derivative by the load F / E*
-    [1/m], and to the stored energy over E* [m^3]."""
+    [1/m], and to the stored energy over E* [m^3].
+    """
     if not model.tilt.on:
         return 0.0, 0.0, 0.0
     a, edge = model.tilt.punch[t], model.tilt.punch[t] * data.tilt.sine[t]

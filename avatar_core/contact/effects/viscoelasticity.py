@@ -198,7 +198,8 @@ def advance_history(model, data):  # type: ignore[no-untyped-def]
 @fast
 def _advance_tips(model, data):  # type: ignore[no-untyped-def]
     """The history that each tip carries along; it ends with the contact. A bonded disc has none:
-    its dent is elastic, as fast contact is."""
+    its dent is elastic, as fast contact is.
+    """
     memory, prony = data.viscoelasticity, model.viscoelasticity
     for t in range(memory.tip_held.shape[0]):
         on = data.active[t] and not is_held(model, data, t)

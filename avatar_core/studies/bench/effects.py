@@ -65,7 +65,7 @@ class EffectRow:
 def build_for_effects(
     surface: SurfaceMesh, n_vertices: int, modes: int, progress: Progress
 ) -> Vademecum:
-    """A vademecum of so many modes at most that serves all effects (minutes)."""
+    """Return a vademecum of so many modes at most that serves all effects (minutes)."""
     linear = Organ.of(surface, n_vertices).linear(BuildRule(max_modes=modes), progress)
     problem = hyperelastic_problem(linear, "neo-hookean")
     return with_large_deformation(linear, problem, "neo-hookean", LargeRule(), progress)
@@ -74,7 +74,7 @@ def build_for_effects(
 def run_effects_bench(
     vademecum: Vademecum, progress: Callable[[str], None]
 ) -> tuple[list[EffectRow], dict[str, float]]:
-    """Rows and summary.
+    """Return the rows and summary.
 
     Everything at once leaves out what needs another tip, and what excludes large deformation.
     """
@@ -102,7 +102,7 @@ def cases_on(vademecum: Vademecum) -> tuple[Case, ...]:
 
 
 def _leaning(vademecum: Vademecum) -> Tilt:
-    """A punch that leans by :data:`LEAN` off the normal of the place where paths set out."""
+    """Return a punch that leans by :data:`LEAN` off the normal of the place where paths set out."""
     normal = vademecum.surface.normals[middle_of_access(vademecum)]
     aside = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     axis = np.cos(LEAN) * normal + np.sin(LEAN) * aside / np.linalg.norm(aside)
@@ -112,7 +112,7 @@ def _leaning(vademecum: Vademecum) -> Tilt:
 def effect_rows(
     vademecum: Vademecum, cases: Sequence[Case], progress: Callable[[str], None] = lambda name: None
 ) -> list[EffectRow]:
-    """The bare scene, then each case against it."""
+    """Return the bare scene, then each case against it."""
     progress("bare")
     linear = replace(vademecum, large=None)
     bare = model_of(linear, (SPHERE,), cloud="volume", effects=()).data()

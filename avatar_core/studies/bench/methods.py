@@ -98,7 +98,7 @@ def time_tip_over_patch(
 def time_dense_table(
     vademecum: Vademecum, n_tools: int, clock: Clock = time.perf_counter, kind: Kind = np.float32
 ) -> StepRow:
-    """The same contacts and field from stored columns, displayed by the same interpolation.
+    """Return the same contacts and field from stored columns, displayed by the same interpolation.
 
     kind : of the stored numbers; in 16 bits each column has a factor of its own
     """
@@ -116,7 +116,7 @@ def time_dense_table(
 def table_over_steps(
     vademecum: Vademecum, clock: Clock = time.process_time, kind: Kind = np.float32
 ) -> float:
-    """Median step of a dense table over that of the vademecum with all modes, one tool.
+    """Return the median step of a dense table over that of the vademecum with all modes, one tool.
 
     Both slide in turn, so that a machine that slows down slows both; the median over the pairs.
     """
@@ -132,14 +132,14 @@ def table_over_steps(
 
 
 def _stepped(data: ContactData) -> Callable[[np.ndarray], object]:
-    """The step, of tools that do not turn."""
+    """Return the step, of tools that do not turn."""
     return lambda tips: step(data.model, data, tips)
 
 
 def _dense(
     vademecum: Vademecum, n_tools: int, kind: Kind = np.float32
 ) -> tuple[ContactData, Callable[[np.ndarray], object]]:
-    """The data that the dense table uses, and its step."""
+    """Return the data that the dense table uses, and its step."""
     cloud, linear = shown_cloud(vademecum), replace(vademecum, large=None)
     data = model_of(linear, (SPHERE,) * n_tools, cloud=cloud).data()
     tables = (*_stored(_columns(vademecum, cloud), kind), *_stored(_compliance(vademecum), kind))
@@ -154,7 +154,7 @@ def _dense(
 
 
 def _stored(table: np.ndarray, kind: Kind) -> tuple[np.ndarray, np.ndarray]:
-    """A table (n_positions, 3, ...) as numbers of a kind, and the factor of each column."""
+    """Return a table (n_positions, 3, ...) as numbers of a kind, and the factor of each column."""
     factor = np.ones(table.shape[:2], np.float32)
     if kind is np.float32:
         return table, factor
@@ -166,7 +166,7 @@ def _stored(table: np.ndarray, kind: Kind) -> tuple[np.ndarray, np.ndarray]:
 def time_direct(
     elasticity: Elasticity, vademecum: Vademecum, n: int = 40, clock: Clock = time.perf_counter
 ) -> StepRow:
-    """One back-substitution with the stored factor per step, one contact."""
+    """Return one back-substitution with the stored factor per step, one contact."""
     surface = vademecum.surface
     loads = patch_loads(elasticity, surface.centers[:n], surface.patch_radius).toarray()
     elasticity.solve(loads[:, :1])
@@ -190,7 +190,7 @@ def time_direct(
 
 
 def load_average() -> float:
-    """Processes that compete for the machine, one-minute mean."""
+    """Return the processes that compete for the machine, one-minute mean."""
     return os.getloadavg()[0]
 
 
@@ -225,7 +225,7 @@ def one_pass(
     call: Callable[[np.ndarray], object],
     clock: Clock = time.perf_counter,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times [us] and contacts of the steps of one path in which all tools touch.
+    """Return the times [us] and contacts of the steps of one path in which all tools touch.
 
     tips : ndarray, shape (n, n_tools, 3) [m]
     clock : of the wall, or of the processor [s]
@@ -244,7 +244,7 @@ def one_pass(
 def tool_paths(
     vademecum: Vademecum, n_tools: int, n: int = 4000, tip: Tip = SPHERE, depth: float | None = None
 ) -> np.ndarray:
-    """Slides of a tip at a depth [m] that start far apart, shape (n, n_tools, 3)."""
+    """Return the slides of a tip at a depth [m] that start far apart, shape (n, n_tools, 3)."""
     starts = starts_apart(vademecum, n_tools)
     if depth is None:  # a flat face that is found 5 mm inside may have been set there: not felt
         depth = DEPTH if tip.offset > 0.0 else DEPTH / 2.0
@@ -253,7 +253,7 @@ def tool_paths(
 
 
 def _columns(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:
-    """Displacement in the blocks of a cloud under every load, shape (n_positions, 3, n)."""
+    """Return displacement in the blocks of a cloud under every load, shape (n_positions, 3, n)."""
     field, n_blocks = vademecum.field, shown_blocks(vademecum, cloud)
     out = np.empty((vademecum.surface.n_positions, 3, n_blocks * BLOCK), np.float32)
     for r in range(field.n_regions):

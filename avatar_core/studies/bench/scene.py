@@ -80,13 +80,13 @@ class _Prepared:
     layout_seconds: float
 
     def timed(self) -> np.ndarray:
-        """Times of one pass from rest [us]."""
+        """Return the times of one pass from rest [us]."""
         data = self.data
         data.reset()
         return one_pass(data, self.tips, lambda tips: step(data.model, data, tips))[0]
 
     def cost(self, times: Sequence[np.ndarray]) -> StepCost:
-        """The medians over the passes."""
+        """Return the medians over the passes."""
         touched = [micro for micro in times if len(micro)]
         p50, p99 = (
             float(np.median([np.quantile(micro, q) for micro in touched] or [np.nan]))
@@ -113,7 +113,7 @@ def _prepared(vademecum: Vademecum, scene: Scene, name: str) -> _Prepared:
 
 
 def _followed(data: ContactData, tips: np.ndarray) -> np.ndarray:
-    """The same ways on an organ that breathes: where it is in each period, from rest."""
+    """Return the same ways on an organ that breathes: where it is in each period, from rest."""
     respiration = data.state.respiration
     if respiration is None:
         return tips

@@ -29,7 +29,7 @@ N_TOOLS = 3  # a sphere has one contact; three of them are at least three
 def run_step_bench(
     surface: SurfaceMesh, n_vertices: int, displayed: Sequence[int], progress: Progress
 ) -> tuple[list[StepRow], dict[str, float]]:
-    """Rows of the table and the summary.
+    """Return the rows of the table and the summary.
 
     n_vertices : of the mesh, all of which are shown; then its surface at each number of
         ``displayed`` vertices
@@ -50,7 +50,7 @@ def run_step_bench(
 
 
 def time_organ(organ: Vademecum) -> tuple[list[StepRow], dict[str, float]]:
-    """Rows and summary of a vademecum as it is."""
+    """Return the rows and summary of a vademecum as it is."""
     rows = _rows(organ, (*MODES, organ.n_modes))
     return rows, {
         "tip_over_patch": time_tip_over_patch(organ, organ.n_modes),
@@ -63,7 +63,7 @@ def time_organ(organ: Vademecum) -> tuple[list[StepRow], dict[str, float]]:
 
 
 def _rows(vademecum: Vademecum, modes: Sequence[int]) -> list[StepRow]:
-    """A vademecum with so many modes and dense tables, with one tool and with several."""
+    """Return a vademecum with so many modes and dense tables, with one tool and with several."""
     rows: list[StepRow] = []
     for n_tools in (1, N_TOOLS):
         rows += [time_steps(vademecum, n_tools, some) for some in modes]
@@ -72,5 +72,5 @@ def _rows(vademecum: Vademecum, modes: Sequence[int]) -> list[StepRow]:
 
 
 def _row(rows: Sequence[StepRow], tools: int, method: str = "vademecum") -> StepRow:
-    """The row of a method, with most modes."""
+    """Return the row of a method, with most modes."""
     return max((r for r in rows if (r.method, r.tools) == (method, tools)), key=lambda r: r.modes)
