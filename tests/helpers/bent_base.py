@@ -26,7 +26,7 @@ N_BASE = 5
 
 
 def bent_phantoms() -> tuple[PatientBase, SurfaceMesh, Registration]:
-    """The base, the patient's surface, and the template registered to it."""
+    """Return the base, the patient's surface, and the template registered to that surface."""
     organ = phantom_liver(0.012)
     mesh = tetrahedralize(organ, 300)
     template = Template("phantom", mesh, regions_by_rule(mesh))
@@ -40,7 +40,7 @@ def bent_phantoms() -> tuple[PatientBase, SurfaceMesh, Registration]:
 
 
 def registration_of(template: Template, vertices: np.ndarray) -> Registration:
-    """The template with its vertices moved there."""
+    """Return a registration that places the template's vertices there, without a quality."""
     still = SimilarityTransform(1.0, np.eye(3), np.zeros(3))
     quality = RegistrationQuality(0.0, 0.0, 0.0, 0.0, 1.0, 0.0, None)  # type: ignore[arg-type]
     mesh = TetMesh(vertices, template.mesh.tets)
@@ -49,7 +49,7 @@ def registration_of(template: Template, vertices: np.ndarray) -> Registration:
 
 @cached_on_disk
 def _responses() -> list[CompactResponse]:
-    """Of the anatomies of the base."""
+    """Compute the responses of the base's anatomies."""
     mesh = tetrahedralize(phantom_liver(0.012), 300)
     regions = regions_by_rule(mesh)
     loads, responses = load_surface(mesh, regions), []
@@ -64,6 +64,6 @@ def _responses() -> list[CompactResponse]:
 
 @cached_on_disk
 def patient_mesh() -> TetMesh:
-    """The patient's own."""
+    """Mesh the patient's surface independently of the template."""
     surface = population(N_BASE + 1, seed=3, bend=0.01)[-1].moved(phantom_liver(0.012))
     return tetrahedralize(surface, 350)

@@ -1,7 +1,7 @@
 """Boxes clamped below and pressed around the middle of their top: exact solutions are near.
 
-A cube of 200 mm is a half-space to a tip; a column of half its width gives way besides. Their
-meshes are there as coarse as that of a liver, their element and their patches are the usual ones.
+A cube of 200 mm acts as a half-space under a tip. A column of half its width also gives way as a
+whole. Near the load their meshes are as coarse as a liver's, with the usual element and patch.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ UP = np.array([0.0, 1.0, 0.0])
 MATERIAL = Material()
 MODULUS = MATERIAL.young_modulus / (1.0 - MATERIAL.poisson_ratio**2)  # E* [Pa]
 PATCH_RADIUS = 12e-3  # [m]
-FINE = 3e-3  # elements on which a patch sinks to 0.1 % of what it does on finer ones [m]
+FINE = 3e-3  # elements on which a patch sinks as on finer ones, to 0.1 % [m]
 _COARSE = 12e-3  # longest edge around the middle of the top [m]
 _PRESSED = 30e-3  # radius of the accessible part [m]
 
 
 def top(body: Body) -> np.ndarray:
-    """The middle of the top, shape (3,) [m]."""
+    """Return the middle of the top, shape (3,) [m]."""
     return np.array([0.5 * WIDTH[body], HEIGHT, 0.5 * WIDTH[body]])
 
 
 def body_mesh(
     body: Body, edge: float = _COARSE, radius: float = 1.5 * _PRESSED
 ) -> tuple[TetMesh, Regions]:
-    """Edges of at most ``edge`` within a radius of the middle of the top, wider ones elsewhere."""
+    """Mesh a box: edges up to ``edge`` within a radius of the top's middle, longer elsewhere."""
     mesh = box_mesh(8, (WIDTH[body], HEIGHT, WIDTH[body]))
     return refine(mesh, box_regions(mesh), [Grading(top(body), UP, edge, radius, 0.0, 0.5)])
 
 
 @cached_on_disk
 def organ(body: Body) -> Vademecum:
-    """The vademecum, with few modes: at the load positions the response is exact with any."""
+    """Build a vademecum with few modes: at load positions the response is exact with any number."""
     mesh, regions = body_mesh(body)
     offset = mesh.vertices[mesh.boundary_faces].mean(axis=1) - top(body)
     near = np.linalg.norm(offset, axis=1) < _PRESSED
@@ -67,7 +67,7 @@ def organ(body: Body) -> Vademecum:
 
 @cached_on_disk
 def patch_compliance(body: Body) -> float:
-    """How far a patch at the middle sinks, for a unit force and fine elements [m/N]."""
+    """Return the sinking of a patch at the middle per unit force, on fine elements [m/N]."""
     mesh, regions = body_mesh(body, FINE, PATCH_RADIUS)
     elasticity = Elasticity(mesh, MATERIAL, regions.clamped)
     load = patch_loads(elasticity, top(body)[None], PATCH_RADIUS)[:, [1]]

@@ -1,4 +1,4 @@
-"""What may happen to the bytes of any file."""
+"""Mutations of the bytes of any file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def zeroed(rng: np.random.Generator, raw: bytearray) -> bytearray:
 
 
 def swapped(rng: np.random.Generator, raw: bytearray) -> bytearray:
-    """Two pieces of the same length change places."""
+    """Exchange two pieces of the same length."""
     length = int(rng.integers(1, max(2, len(raw) // 4)))
     a, b = (int(k) for k in rng.integers(0, max(1, len(raw) - length), 2))
     raw[a : a + length], raw[b : b + length] = raw[b : b + length], raw[a : a + length]

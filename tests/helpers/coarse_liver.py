@@ -22,12 +22,12 @@ from tests.helpers.contact import prepare, step
 from tests.helpers.disk_cache import cached_on_disk
 
 RADIUS = 5e-3  # of the tips [m]
-DEEP = (6e-3, 12e-3, 18e-3)  # where places have access, too [m]
+DEEP = (6e-3, 12e-3, 18e-3)  # depths at which places have access, too [m]
 
 
 @cached_on_disk
 def liver(scale: float = 1.0) -> Vademecum:
-    """The phantom, coarse: what matters here is not how exact it is."""
+    """Build the phantom on a coarse mesh, for tests that need no accuracy."""
     surface = phantom_liver(12e-3)
     surface = replace(surface, vertices=scale * surface.vertices)
     options = OrganOptions(
@@ -48,7 +48,7 @@ def liver_model(
     scale: float = 1.0,
     shape: Shape = "sphere",
 ) -> ContactData:
-    """The model of the liver, at rest; several tools bring their effect along."""
+    """Return the liver's model at rest; several tools add their effect."""
     if n_tools > 1:
         effects = (SeveralTools(), *effects)
     data = _prepared(effects, n_tools, Tip(shape, radius), scale)
@@ -67,14 +67,14 @@ class Spot(NamedTuple):
     def tip(
         self, depth: float, along: float = 0.0, across: float = 0.0, radius: float = RADIUS
     ) -> np.ndarray:
-        """Centre of a sphere that is so deep in the tangent plane, shape (3,)."""
+        """Return the centre of a sphere at a depth in the tangent plane, shape (3,)."""
         aside = along * self.along + across * self.across
         return self.center + (radius - depth) * self.normal + aside
 
 
 @cache
 def spots(margin: float = 20e-3, scale: float = 1.0) -> tuple[Spot, ...]:
-    """Places with access all around them and below, where there is a margin."""
+    """Find places with access below them and, with a margin, all around."""
     v = liver(scale)
     out = []
     for j in inner_positions(v, margin):
@@ -88,12 +88,12 @@ def spots(margin: float = 20e-3, scale: float = 1.0) -> tuple[Spot, ...]:
 
 
 def any_spot(margin: float = 20e-3) -> st.SearchStrategy[Spot]:
-    """One of them; by number, so that the liver is built when a test runs."""
+    """Draw a place by its number, so that the liver is built only when a test runs."""
     return st.integers(0, 10**6).map(lambda k: spots(margin)[k % len(spots(margin))])
 
 
 def press_in(data: ContactData, spot: Spot, depth: float) -> None:
-    """Press a tip into the liver, 1 mm a period."""
+    """Press a tip into the liver, 1 mm per period."""
     for d in np.append(np.arange(-1e-3, depth, 1e-3), depth):
         step(data, spot.tip(d)[None])
     assert data.state.passage[0] == ENTERED

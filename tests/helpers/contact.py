@@ -1,4 +1,4 @@
-"""Data of a contact model, stepped without naming the model: for tests of a single loop."""
+"""Data of a contact model, and steps without naming the model, for tests of a single loop."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from avatar_core.contact.model import ContactData, ContactModel
 
 
 def prepare(*arguments: Any, **options: Any) -> ContactData:
-    """Data of a new model; arguments of :func:`avatar_core.contact.model.model_of`."""
+    """Prepare data of a new model; arguments of :func:`avatar_core.contact.model.model_of`."""
     return contact.model_of(*arguments, **options).data()
 
 
 def data_of(arrays: Any) -> ContactData:
-    """Data of a model of arrays that were laid out."""
+    """Prepare data of a model whose arrays are laid out already."""
     return ContactModel(arrays).data()
 
 
@@ -37,8 +37,8 @@ def estimate_error(data: ContactData) -> None:
 
 
 def turning(shaft: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """The quaternion x y z w, shape (1, 4), that turns one unit vector into another."""
+    """Return the quaternion x y z w, shape (1, 4), that turns one unit vector into another."""
     half = np.append(np.cross(shaft, axis), 1.0 + shaft @ axis)
-    if half[3] < 1e-12:  # half a turn, about any line across
+    if half[3] < 1e-12:  # half a turn, about any perpendicular line
         half[:3] = np.cross(shaft, np.eye(3)[np.argmin(np.abs(shaft))])
     return (half / np.linalg.norm(half))[None]

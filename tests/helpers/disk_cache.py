@@ -1,8 +1,7 @@
-"""What tests compute from the code under test, computed once for all that ask for it.
+"""Results computed from the code under test, once for all tests that ask for them.
 
-A result is found by the content of everything that it may follow from: its arguments, the file of
-the function that computes it, the core, Python and all installed packages. Only one worker computes
-a result; the others wait for it.
+A result is found by a hash of all its inputs: the arguments, the file of the computing function,
+the core, Python and all installed packages. One worker computes a result; the others wait for it.
 """
 
 from __future__ import annotations
@@ -33,30 +32,32 @@ from avatar_core.common.compiled_cache import ContentCache, content
 P, T = ParamSpec("P"), TypeVar("T")
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "avatar" / "tests"
-UNUSED = 14 * 86400.0  # after which a result is removed [s]
+UNUSED = 14 * 86400.0  # unused results are removed after this time [s]
 _CORE = Path(avatar_core.__file__).parent
-_LATE_ROOMS = {"studies", "cli"}  # nothing that is stored comes from them
+_LATE_ROOMS = {"studies", "cli"}  # no stored result depends on them
 
 
 def of_all(*values: Any) -> tuple[Any, ...]:
-    """All arguments of a function, of which its result is made."""
+    """Return all arguments: the result depends on each of them."""
     return values
 
 
 def cached_on_disk(compute: Callable[P, T]) -> Callable[P, T]:
-    """Decorator: keep what a function gives; it is the same object for all tests of a worker."""
+    """Decorate a function: keep its result, one object for all tests of a worker."""
     return in_memory(on_disk(compute))
 
 
 def on_disk(
     compute: Callable[P, T], told: Callable[..., Any] = of_all, rooms: tuple[str, ...] | None = None
 ) -> Callable[P, T]:
-    """What a function gives, kept for all workers and runs, each time as another object.
+    """Keep a function's result for all workers and runs; each call returns a new object.
 
     Parameters
     ----------
-    told : gives the values of the arguments that the result may follow from
-    rooms : rooms of the core that the result may follow from; by default all but the last
+    told : callable
+        Takes the arguments, returns the values that the result depends on.
+    rooms : tuple of str, optional
+        Rooms of the core that the result depends on; by default all but the last.
     """
 
     @functools.wraps(compute)
@@ -79,12 +80,14 @@ def on_disk(
 def in_memory(
     compute: Callable[P, T], told: Callable[..., Any] = of_all, kept: int = sys.maxsize
 ) -> Callable[P, T]:
-    """What a function gives, the same object for all tests of a worker.
+    """Keep a function's result in memory, one object for all tests of a worker.
 
     Parameters
     ----------
-    told : gives the values of the arguments that the result may follow from
-    kept : number of results that are kept
+    told : callable
+        Takes the arguments, returns the values that the result depends on.
+    kept : int
+        Number of results that are kept.
     """
     results: OrderedDict[str, T] = OrderedDict()
 
@@ -102,12 +105,12 @@ def in_memory(
 
 
 def copied(compute: Callable[P, T]) -> Callable[P, T]:
-    """What a function gives, each time as an object of its own."""
+    """Wrap a function so that each call returns a copy of its result."""
     return lambda *arguments, **named: copy.deepcopy(compute(*arguments, **named))
 
 
 def compiled_once(compile_function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """In the place of ``Dispatcher.compile``: what another worker compiles is waited for."""
+    """Replace ``Dispatcher.compile``: wait for code that another worker is compiling."""
 
     def compile_locked(dispatcher: Any, signature: Any) -> Any:
         if not isinstance(dispatcher._cache, ContentCache):
@@ -121,7 +124,7 @@ def compiled_once(compile_function: Callable[[Any, Any], Any]) -> Callable[[Any,
 
 
 def digest(*values: Any) -> str:
-    """The same text for the same content only: arrays, files, numbers, texts and collections."""
+    """Hash arrays, files, numbers, texts and collections by their content."""
     total = hashlib.blake2b(digest_size=32)
 
     def take(value: Any) -> None:
@@ -160,7 +163,7 @@ def _all_rooms() -> set[str]:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """No other process is in here with the same file."""
+    """Hold the lock of a file against other processes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -169,6 +172,6 @@ def locked(path: Path) -> Iterator[None]:
 
 def _drop_unused() -> None:
     for file in CACHE.iterdir():
-        with suppress(FileNotFoundError):  # another worker has just finished its part
+        with suppress(FileNotFoundError):  # another worker has just renamed its part
             if file.stat().st_mtime < time.time() - UNUSED:
                 file.unlink()

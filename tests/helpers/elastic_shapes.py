@@ -1,4 +1,4 @@
-"""Meshes whose elastic response is known, or can be compared, and what is felt on them."""
+"""Meshes whose elastic response is known or can be compared, with loads and compliances."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from avatar_core.fem.hyperelasticity import Hyperelasticity
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.mesh import Regions, TetMesh, make_mesh
 
-TOP = np.array([[0.05, 0.1, 0.05], [0.03, 0.1, 0.06]])  # of a cube
+TOP = np.array([[0.05, 0.1, 0.05], [0.03, 0.1, 0.06]])  # load positions on the top of a cube [m]
 
 
 def block(*lines: np.ndarray) -> TetMesh:
-    """A box of cells between the grid lines of the three axes, six tetrahedra each."""
+    """Mesh a box: cells between the grid lines of three axes, six tetrahedra each."""
     size = [len(line) for line in lines]
     number = np.arange(np.prod(size)).reshape(size)
     steps = np.meshgrid(*(np.arange(n - 1) for n in size), indexing="ij")
@@ -30,12 +30,12 @@ def block(*lines: np.ndarray) -> TetMesh:
 
 
 def box_mesh(n: int, size: tuple[float, float, float] = (0.1, 0.1, 0.1)) -> TetMesh:
-    """A box of n^3 equal cells."""
+    """Mesh a box with n^3 equal cells."""
     return block(*(np.arange(n + 1) * length / n for length in size))
 
 
 def box_regions(mesh: TetMesh) -> Regions:
-    """Clamped at y = 0, accessible at the opposite side."""
+    """Clamp the faces at y = 0 and make the opposite faces accessible."""
     y = mesh.vertices[mesh.boundary_faces][..., 1]
     return Regions((y < 1e-9).all(axis=1), (y > y.max() - 1e-9).all(axis=1))
 
@@ -44,15 +44,15 @@ cube, regions_of = box_mesh, box_regions
 
 
 def clamped_cube(n: int, nu: float = 0.48, element: Element | None = None) -> Elasticity:
-    """A cube of 0.1 m on its clamped side, of n^3 cells."""
+    """Return a cube of 0.1 m with n^3 cells, clamped at the bottom."""
     mesh = box_mesh(n)
     return Elasticity(mesh, Material(poisson_ratio=nu), box_regions(mesh).clamped, element)
 
 
 def shell_octant(n: int, radii: np.ndarray) -> TetMesh:
-    """An octant of a thick sphere: n^2 triangles over the octant, prisms between the radii.
+    """Mesh an octant of a thick sphere: n^2 triangles over the octant, prisms between the radii.
 
-    Vertices lie outside of the spheres by so much that the polyhedra have the spheres' volumes.
+    Vertices lie slightly outside the spheres, so that the polyhedra have the spheres' volumes.
     """
     lattice = np.array([(i, j, n - i - j) for i in range(n + 1) for j in range(n + 1 - i)])
     number = {tuple(p): k for k, p in enumerate(lattice[:, :2].tolist())}
@@ -83,7 +83,7 @@ def shell_octant(n: int, radii: np.ndarray) -> TetMesh:
 
 
 def nodes_of(problem: Elasticity | Hyperelasticity) -> np.ndarray:
-    """Node positions: vertices, then (P2, Taylor-Hood) edge midpoints, shape (n_nodes, 3) [m]."""
+    """Return node positions: vertices, then (P2, Taylor-Hood) edge midpoints, (n_nodes, 3) [m]."""
     linear = problem.linear if isinstance(problem, Hyperelasticity) else problem
     vertices = linear.mesh.vertices
     if linear.element == "P1":
@@ -92,12 +92,14 @@ def nodes_of(problem: Elasticity | Hyperelasticity) -> np.ndarray:
 
 
 def force_on(problem: Elasticity, faces: np.ndarray, traction: np.ndarray) -> np.ndarray:
-    """Nodal forces of a traction that is constant on each face, (3 n_nodes, 1) [N].
+    """Return nodal forces of a constant traction on each face, shape (3 n_nodes, 1) [N].
 
     Parameters
     ----------
-    faces : ndarray of int, numbers of boundary faces
-    traction : ndarray, shape (3,) or (n_faces, 3) [Pa]
+    faces : ndarray of int
+        Numbers of boundary faces.
+    traction : ndarray, shape (3,) or (n_faces, 3)
+        Traction [Pa].
     """
     nodes = problem.face_nodes[faces]
     # a linear face hands its load to its corners, a quadratic one to the midpoints of its edges
@@ -109,6 +111,6 @@ def force_on(problem: Elasticity, faces: np.ndarray, traction: np.ndarray) -> np
 
 
 def compliance(problem: Elasticity, centers: np.ndarray = TOP, radius: float = 0.04) -> np.ndarray:
-    """Patch displacements for unit patch forces, (3 n, 3 n) [m/N]."""
+    """Return patch displacements for unit patch forces, shape (3 n, 3 n) [m/N]."""
     loads = patch_loads(problem, centers, radius)
     return np.asarray(loads.T @ problem.solve(loads))

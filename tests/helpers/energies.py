@@ -1,4 +1,4 @@
-"""Energies of a model's state, by what its step keeps."""
+"""Energies of a contact model, from the state that its step keeps."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from avatar_core.tips.profile import STIFFNESS, TAKEN
 
 
 def stored_energy(data: ContactData) -> float:
-    """Elastic energy of the organ, lambda . C lambda / 2 and that of large deformation [J].
+    """Return the organ's elastic energy: lambda . C lambda / 2 plus large deformation [J].
 
-    Not defined with viscoelasticity, which stores and dissipates at once.
+    Viscoelastic models have none: they store and dissipate at the same time.
     """
     state = data.state
     active = np.flatnonzero(state.force > 0.0)
@@ -38,18 +38,18 @@ def stored_energy(data: ContactData) -> float:
 
 
 def dent_energy(data: ContactData, t: int) -> float:
-    """E* (Phi + Psi) - c F^2 / 2 of a tip at rest [J]."""
+    """Return the energy E* (Phi + Psi) - c F^2 / 2 of a tip's dent at rest [J]."""
     model, state, law = data.model.arrays, data.state, data.state.law
     stored = of_profile(model, state, t)
     stiffness, taken = law.value[t, STIFFNESS], law.value[t, TAKEN]
     load = law.elastic[t] / stiffness
     stored += evaluate_large_dent(model, t, load)[2]
-    if model.tilt is not None:  # as compiled code finds it
+    if model.tilt is not None:  # in the form that compiled code gets
         leaning = SimpleNamespace(tilt=SimpleNamespace(on=True, **model.tilt._asdict()))
         stored += evaluate_tilt(leaning, state, t, load)[2]
     return float(stiffness * stored - 0.5 * taken * law.elastic[t] ** 2)
 
 
 def kinetic_energy(data: ContactData) -> float:
-    """sum_k m_k v_k^2 / 2 [J]."""
+    """Return the kinetic energy sum_k m_k v_k^2 / 2 [J]."""
     return float(0.5 * data.model.arrays.inertia.mass @ data.state.inertia.velocity**2)

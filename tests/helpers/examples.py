@@ -1,6 +1,6 @@
-"""How many examples property tests draw: few in the quick suite, all with ``-m long``.
+"""Number of examples that property tests draw: few in the quick suite, all with ``-m long``.
 
-The same in every run; ``--hypothesis-profile=default`` looks for new ones.
+Every run draws the same examples; ``--hypothesis-profile=default`` looks for new ones.
 """
 
 from __future__ import annotations
@@ -11,22 +11,22 @@ import pytest
 from hypothesis import Phase, settings
 
 FEW, ALL = "few", "all"
-_PART = 8  # of the examples, one in so many in the quick suite
+_PART = 8  # the quick suite draws one example in this many
 
 settings.register_profile(FEW, deadline=None, derandomize=True, print_blob=True, max_examples=12)
 settings.register_profile(ALL, deadline=None, derandomize=True, print_blob=True)
 
 
 def choose(config: pytest.Config) -> None:
-    """Load the profile of this run."""
+    """Load the hypothesis profile of this run."""
     chosen = config.getoption("--hypothesis-profile", None)
     settings.load_profile(chosen or (ALL if _is_long(config) else FEW))
 
 
 def examples(n: int, least: int = 1, **more: Any) -> settings:
-    """Settings for ``n`` examples, of which the quick suite draws the first few.
+    """Return settings for ``n`` examples; the quick suite draws only the first of them.
 
-    least : the fewest that it draws; with 0, those that are written out are enough for it
+    least : smallest number drawn there; 0 runs only the examples written out in the test
     """
     few = settings.get_current_profile_name() == FEW
     if few and not least:
@@ -35,7 +35,7 @@ def examples(n: int, least: int = 1, **more: Any) -> settings:
 
 
 def mark(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """In a run of the long tests, tests that draw examples belong to them."""
+    """Mark tests that draw examples as long when the long tests run."""
     for item in items if _is_long(config) else []:
         drawn = getattr(getattr(item, "obj", None), "is_hypothesis_test", False)
         if drawn or item.get_closest_marker("examples"):

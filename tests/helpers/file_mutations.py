@@ -1,9 +1,9 @@
-"""Vademecum and atlas files, and what others may make of them.
+"""Mutations of vademecum and atlas files.
 
-Arrays that claim what they do not hold, and links, are test_hostile_files.py's.
+Arrays with false sizes and links are tested in test_hostile_files.py.
 
-Bytes are changed blindly, and structure on purpose; then the checksum is made right again, so that
-it is the reader that has to notice. Each mutation is a function of a seed alone.
+Bytes change at random, structure on purpose. Most mutants then get a valid checksum, so that the
+reader itself must find the fault. Each mutation is a function of a seed alone.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from avatar_core.vademecum.storage import save_vademecum
 from tests.helpers.byte_mutations import OF_BYTES, pick, some
 from tests.helpers.small_files import small_atlas, small_vademecum
 
-_SEALED = 0.7  # of the mutants get a checksum that is right
+_SEALED = 0.7  # part of the mutants that get a valid checksum
 _JSON_VALUES: tuple[Any, ...] = (
     *(None, True, 0, -1, 10**400, 1e308, float("nan"), "", "x", [], {}, [1], [[1]], {"a": 1}),
     *("\n\x1b[31m", "x" * 5000, 2**53, 0.5, "neo-hookean", [float("inf")] * 3),
@@ -40,7 +40,7 @@ ATLAS_FILES = (FRAME, SHAPE, LEVEL_SET, RESPONSE)
 
 
 def write_small_atlas(folder: Path) -> None:
-    """An atlas of two balls in a new folder."""
+    """Write an atlas of two balls to a new folder."""
     folder.mkdir()
     frame, anatomies = small_atlas()
     save_frame(folder, frame, "small")
@@ -50,7 +50,7 @@ def write_small_atlas(folder: Path) -> None:
 
 @cache
 def pristine(kind: str, variant: int = 0) -> bytes:
-    """The bytes of a small vademecum, whose variants have ever more parts, or of ATLAS_FILES."""
+    """Return the bytes of an ATLAS_FILES kind or of a small vademecum, its parts by variant."""
     import tempfile
 
     with tempfile.TemporaryDirectory() as name:
@@ -63,7 +63,7 @@ def pristine(kind: str, variant: int = 0) -> bytes:
 
 
 def mutant(kind: str, seed: int) -> bytes:
-    """A file of a kind that something has happened to."""
+    """Return a mutated file of a kind."""
     rng = np.random.default_rng(seed)
     raw = pristine(kind, seed % 4 if kind == "vademecum" else 0)
     if seed % 2:
@@ -82,7 +82,7 @@ def mutant(kind: str, seed: int) -> bytes:
 
 
 def sealed(raw: bytes) -> bytes:
-    """With the checksum of what the bytes hold now, if they can still be read."""
+    """Replace the stated checksum by that of the present content, if it can still be read."""
     found = forked(_checksums, raw)
     if not found:
         return raw
@@ -91,7 +91,7 @@ def sealed(raw: bytes) -> bytes:
 
 
 def forked(function: Callable[[bytes], bytes], raw: bytes, seconds: int = 2) -> bytes:
-    """What a function gives, or nothing if it dies: of some of these bytes HDF5 does."""
+    """Call a function in a child process; return nothing if the child dies, as HDF5 may."""
     ours, theirs = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -107,7 +107,7 @@ def forked(function: Callable[[bytes], bytes], raw: bytes, seconds: int = 2) -> 
 
 
 def _checksums(raw: bytes) -> bytes:
-    """The one that is stated and the one that is true."""
+    """Return the stated and the true checksum."""
     with h5py.File(io.BytesIO(raw), "r") as file:
         attributes = root_attributes(file)
         stated = attributes.pop("checksum")
@@ -131,10 +131,10 @@ def _seal(file: h5py.File) -> None:
         attributes.pop("checksum", None)
         file.attrs["checksum"] = checksum(_small_arrays(file), attributes)
     except UNREADABLE:
-        return  # of what points nowhere there is no checksum
+        return  # there is no checksum of links that point nowhere
 
 
-# --- what happens to structure --------------------------------------------------------------------
+# --- mutations of structure -----------------------------------------------------------------------
 
 
 def _dataset(rng: np.random.Generator, file: h5py.File) -> h5py.Dataset:
@@ -193,7 +193,7 @@ def _removed(rng: np.random.Generator, file: h5py.File) -> None:
 
 
 def _groups(rng: np.random.Generator, file: h5py.File) -> None:
-    """Very deep, or very many."""
+    """Add very deep or very many groups."""
     if rng.random() < 0.5:
         group = file
         for _ in range(200):
@@ -204,7 +204,7 @@ def _groups(rng: np.random.Generator, file: h5py.File) -> None:
 
 
 def _attribute(rng: np.random.Generator, file: h5py.File) -> None:
-    """Another type or size."""
+    """Give an attribute another type or size."""
     name = pick(rng, tuple(file.attrs))
     values: tuple[Any, ...] = (
         1,
@@ -224,7 +224,7 @@ def _attribute(rng: np.random.Generator, file: h5py.File) -> None:
 
 
 def _json(rng: np.random.Generator, file: h5py.File) -> None:
-    """A value in the JSON of an attribute becomes another."""
+    """Change a value in the JSON of an attribute."""
     names = [name for name, value in file.attrs.items() if str(value)[:1] in "{["]
     if names:
         name = pick(rng, tuple(names))
@@ -232,7 +232,7 @@ def _json(rng: np.random.Generator, file: h5py.File) -> None:
 
 
 def _changed(rng: np.random.Generator, value: Any) -> Any:
-    """JSON in which one value at some depth is another, missing or new."""
+    """Change, remove or add one value at some depth of a JSON document."""
     if isinstance(value, dict) and value and rng.random() < 0.9:
         key = pick(rng, tuple(value))
         if rng.random() < 0.1:
@@ -259,6 +259,6 @@ def _pick_fitting(rng: np.random.Generator) -> Callable[..., None]:
         try:
             change(rng, file)
         except (OSError, RuntimeError, KeyError, TypeError, ValueError, MemoryError):
-            return  # a change before left nothing that this one could change
+            return  # an earlier change left nothing to change
 
     return attempt

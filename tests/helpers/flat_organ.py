@@ -1,7 +1,7 @@
-"""An organ that is all flat, or a ball: one load position, the same response everywhere.
+"""An organ that is a plane or a ball: one load position, the same response everywhere.
 
-phi = z, or |x| - R; the patch answers with the compliance C = far + near in every direction, so
-that contact, friction and relaxation have closed forms.
+phi = z, or |x| - R. The patch has the compliance C = far + near in every direction, so that
+contact, friction and relaxation have closed forms.
 """
 
 from __future__ import annotations
@@ -48,11 +48,16 @@ def flat_organ(
     neo_hookean: float | None = None,
     is_ball: bool = False,
 ) -> ContactData:
-    """The contact model of the flat organ, one tool.
+    """Return the contact model of the flat organ with one tool.
 
-    points : ndarray, shape (n, 3), whose displacement is shown: of the patch's nothing [m]
-    neo_hookean : Poisson's ratio of an organ of large strain, whose patches respond linearly
-    is_ball : whether the organ is the ball
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3)
+        Points whose displacement is shown; the patch displaces none of them [m].
+    neo_hookean : float, optional
+        Poisson's ratio of an organ with large strain, whose patches respond linearly.
+    is_ball : bool
+        Whether the organ is the ball.
     """
     spacing, single, shape = 3e-3, np.float32, (41, 41, 41 if is_ball else 21)
     origin = -0.5 * spacing * (np.array(shape) - 1)
@@ -118,7 +123,7 @@ def flat_organ(
 
 
 def _ground(field: TipField, tip: Tip, period: float) -> Ground:
-    """What effects see of the organ."""
+    """Return the part of the organ that effects read."""
     surface = SimpleNamespace(patch_radius=PATCH_RADIUS)
     organ: Any = SimpleNamespace(surface=surface, tip_field=field)
     nothing: Any = None
@@ -126,11 +131,11 @@ def _ground(field: TipField, tip: Tip, period: float) -> Ground:
 
 
 def at_depth(depth: float, x: float = 0.0, y: float = 0.0, offset: float = RADIUS) -> np.ndarray:
-    """Centre of a tip that presses this deep into the flat organ at rest, shape (1, 3)."""
+    """Return the centre of a tip at a depth in the flat organ at rest, shape (1, 3)."""
     return np.array([[x, y, offset - depth]])
 
 
 def force_at_depth(data: ContactData, depth: float, x: float = 0.0) -> float:
-    """Normal force on the tip in a period at this depth [N]."""
+    """Step with the tip at this depth and return the normal force [N]."""
     step(data, at_depth(depth, x, offset=float(data.model.arrays.tip_offset[0])))
     return float(data.out.force[0, 2])

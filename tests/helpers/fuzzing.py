@@ -1,10 +1,10 @@
-"""Mutants at the doors, in processes that may die of them, and what became of each.
+"""Mutated files given to the loaders, in processes that may die, and the outcome for each.
 
     python tests/helpers/fuzzing.py DOOR FIRST LAST [FOLDER]
 
-Opens mutants one after another, as a node does: confined to another process. A line of JSON for
-each seed, begun before the file is opened: should this process die all the same, that is seen. With
-a folder, the mutants stay in it.
+Opens mutants one after another, as a node does: confined to another process. Each seed prints a
+line of JSON. The line begins before the file is opened, so that it shows if this process dies. The
+mutants are kept in FOLDER, if given.
 """
 
 from __future__ import annotations
@@ -23,26 +23,30 @@ from pathlib import Path
 from typing import Any
 
 OUTCOMES = ("loaded", "refused")
-SECONDS = 4.0  # to read, as in a node
-PATIENCE = 90.0  # for the process that reads to be started again on a busy machine, too
-MEMORY = 2 << 30  # of it
+SECONDS = 4.0  # time limit for reading, as in a node
+PATIENCE = 90.0  # limit that includes a restart of the reading process on a busy machine
+MEMORY = 2 << 30  # limit for the reading process [bytes]
 LONGEST_LINE = 600
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """door : of DOORS; results : by seed, what it says of each mutant."""
+    """Outcomes of many mutants.
+
+    door : a key of DOORS
+    results : for each seed, the outcome and its message
+    """
 
     door: str
     results: dict[int, dict[str, Any]]
 
     @property
     def counts(self) -> Counter[str]:
-        """Mutants by outcome."""
+        """Return the number of mutants by outcome."""
         return Counter(result["outcome"] for result in self.results.values())
 
     def failures(self) -> list[str]:
-        """What is neither loaded nor refused as it should be, with the command that repeats it."""
+        """List mutants neither loaded nor properly refused, with the command to repeat each."""
         return [
             f"{result['outcome']} ({result['message'][:100]}): python tests/helpers/fuzzing.py "
             f"{self.door} {seed} {seed + 1} FOLDER"
@@ -52,7 +56,7 @@ class Campaign:
 
 
 def campaign(door: str, seeds: range) -> Campaign:
-    """Open all mutants at a door; a process that dies is a result, and another one goes on."""
+    """Open all mutants at a door; when the process dies, record that and start another."""
     results: dict[int, dict[str, Any]] = {}
     while len(results) < len(seeds):
         first = seeds.start + len(results)
@@ -72,14 +76,19 @@ def campaign(door: str, seeds: range) -> Campaign:
 def _result(line: str, end: str) -> dict[str, Any]:
     try:
         return dict(json.loads(line))
-    except ValueError:  # the last one, that the process died of
+    except ValueError:  # the last line: the process died before finishing it
         seed = int(line.split(":")[1].split(",")[0])
         return {"seed": seed, "outcome": "died", "message": end}
 
 
 @dataclass(frozen=True)
 class Door:
-    """make : suffix and bytes of a mutant; read : what opens it; check : what was read."""
+    """A loader under test.
+
+    make : returns suffix and bytes of a mutant
+    read : opens the mutant's file
+    check : checks the result
+    """
 
     make: Callable[[int], tuple[str, bytes]]
     read: Callable[[Path], Any]
@@ -87,7 +96,7 @@ class Door:
 
 
 def _confined(function: Callable[[Path], Any], make: Any, check: Callable[[Any], None]) -> Door:
-    """A door behind which another process reads."""
+    """Return a door whose file is read in another process."""
     from avatar_core.common.confined import Confined
 
     return Door(make, partial(Confined(MEMORY).call, SECONDS, function), check)
@@ -114,7 +123,7 @@ def _vademecum() -> Door:
 
 
 def _step() -> Door:
-    """A vademecum that loads is also touched, by compiled code."""
+    """Load a vademecum and also touch it, with compiled code."""
     import numpy as np
 
     from avatar_core.geometry.tip import Tip
@@ -135,7 +144,7 @@ def _step() -> Door:
             try:
                 data = prepare(vademecum, (Tip("sphere", 5e-3),), cloud="volume")
             except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError):
-                return  # a contact node refuses it with what this says
+                return  # a contact node refuses it with this error's message
         for direction in directions:
             for height in (4e-3, 2e-3, -50e-3):
                 step(data, (direction * (RADIUS + height))[None])
@@ -144,7 +153,7 @@ def _step() -> Door:
 
 
 def _atlas() -> Door:
-    """An atlas of which one file is a mutant; the name of the mutant says which."""
+    """Load an atlas with one mutated file, which the mutant's name tells."""
     import numpy as np
 
     from tests.helpers.file_mutations import ATLAS_FILES, mutant
@@ -163,7 +172,7 @@ def _atlas() -> Door:
 
 
 def _read_atlas_with(mutant: Path) -> tuple[list[Any], list[Any]]:
-    """Anatomies, distances and responses of the small atlas with one file in place of its own."""
+    """Read anatomies, distances and responses of the small atlas with one file replaced."""
     from avatar_core.atlas.storage import FRAME, load_atlas
     from tests.helpers.file_mutations import write_small_atlas
 
@@ -194,7 +203,7 @@ def _surface() -> Door:
 
 
 def _loader() -> Door:
-    """As load_vademecum answers a request."""
+    """Load a vademecum as load_vademecum answers a request."""
     from avatar_ros.framework import conversions
     from avatar_ros.framework.library import read_in_library
     from avatar_ros.framework.reader import Reader
@@ -217,7 +226,7 @@ def _loader() -> Door:
 
 
 def _patient() -> Door:
-    """As the process of interpolate_patient takes a file; every fifth as an inline mesh."""
+    """Read a file as interpolate_patient's process does; every fifth as an inline mesh."""
     from types import SimpleNamespace
 
     from avatar_ros.framework import conversions
@@ -244,7 +253,7 @@ def _patient() -> Door:
 
 
 def _every() -> Door:
-    """The doors of the core in turn, so that they share what takes longest, the imports."""
+    """Use the core's doors in turn, so that they share the slow imports."""
     doors = (_vademecum(), _atlas(), _surface())
     turn = 0
 
@@ -268,13 +277,13 @@ DOORS: dict[str, Callable[[], Door]] = {
 
 
 def open_one(door: Door, seed: int, folder: Path) -> dict[str, Any]:
-    """What became of a mutant: ``outcome`` refused, loaded, or what is wrong."""
+    """Open a mutant; return the outcome "loaded", "refused" or a failure, and its message."""
     from avatar_core.errors import AvatarError
 
     suffix, content = door.make(seed)
     path = folder / f"{seed}.{suffix}"
     path.write_bytes(content)
-    signal.setitimer(signal.ITIMER_REAL, PATIENCE)  # nobody handles it: it ends the process
+    signal.setitimer(signal.ITIMER_REAL, PATIENCE)  # unhandled, so that it ends the process
     outcome, message = "loaded", ""
     try:
         door.check(door.read(path))

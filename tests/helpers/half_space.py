@@ -12,21 +12,21 @@ from avatar_core.geometry.tip import Tip
 
 
 def flat(r: float) -> float:
-    """Slope of a surface that does not fall away from the tip."""
+    """Return the slope 0 of a plane surface."""
     return 0.0
 
 
 def sneddon(tip: Tip, depth: float, modulus: float, fall: Callable[[float], float] = flat) -> float:
-    """Force of a tip at a depth, by Abel's integrals over its slope (Sneddon 1965) [N].
+    """Return the force of a tip at a depth, by Abel's integrals over its slope (Sneddon 1965) [N].
 
     modulus : E / (1 - nu^2) of the half-space [Pa]
-    fall : slope with which the surface falls away at a distance [m] from the tip
+    fall : slope with which the surface falls away at a distance [m] from the tip's axis
     """
     if tip.shape == "flat":
         return 2.0 * modulus * tip.radius * depth
 
     def integral(a: float, power: int) -> float:
-        """int_0^a r^power f'(r) / sqrt(a^2 - r^2) dr."""
+        """Integrate int_0^a r^power f'(r) / sqrt(a^2 - r^2) dr."""
 
         def inner(angle: float) -> float:
             r = a * np.sin(angle)
@@ -39,7 +39,7 @@ def sneddon(tip: Tip, depth: float, modulus: float, fall: Callable[[float], floa
 
 
 def slope(tip: Tip, r: float) -> float:
-    """f'(r) of a sphere or a cone, rounded or not."""
+    """Return the slope f'(r) of a sphere or a cone, rounded or not."""
     ball, cotangent = tip.radius, np.inf
     if tip.half_angle is not None:
         ball, cotangent = tip.rounding or 0.0, 1.0 / np.tan(np.radians(tip.half_angle))
@@ -48,6 +48,6 @@ def slope(tip: Tip, r: float) -> float:
 
 
 def on_soft_base(force_at: Callable[[float], float], depth: float, base: float) -> float:
-    """Force where the half-space gives way besides, by ``base`` [m/N]."""
+    """Return the force on a half-space that rests on a spring of compliance ``base`` [m/N]."""
     dent = brentq(lambda d: d + base * force_at(d) - depth, 0.0, depth, xtol=1e-15)
     return float(force_at(dent))

@@ -1,4 +1,4 @@
-"""Surfaces whose solid is known, whole and spoilt, and what is asked of their level sets."""
+"""Surfaces whose solid is known, intact and damaged, and measures of their level sets."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RADIUS = 0.06  # of the ball [m]
 
 
 def ball(radius: float = RADIUS, centre=(0.0, 0.0, 0.0), level: int = 4) -> SurfaceMesh:
-    """Subdivided icosahedron, blown up so that its volume is the ball's."""
+    """Subdivide an icosahedron and scale it to the volume of the ball."""
     vertices, faces = igl.icosahedron()
     for _ in range(level):
         vertices, faces = igl.upsample(vertices, faces)
@@ -33,7 +33,7 @@ def ball_volume(radius: float = RADIUS) -> float:
 
 
 def torus(radius: float, tube: float, n: int = 96) -> SurfaceMesh:
-    """About the z axis, n x n/2 quads."""
+    """Mesh a torus about the z axis with n x n/2 quads."""
     m = n // 2
     u, v = np.meshgrid(2 * np.pi * np.arange(n) / n, 2 * np.pi * np.arange(m) / m, indexing="ij")
     ring = radius + tube * np.cos(v)
@@ -49,7 +49,7 @@ DEPTH = 0.06  # of the fissure, from the top [m]
 
 
 def fissured_block(width: float) -> SurfaceMesh:
-    """A block about the origin, cut from the top (z) in its middle (x = 0), all along y."""
+    """Mesh a block about the origin with a slot at x = 0 from the top (z), all along y."""
     (x, y, z), w = SIZE / 2, width / 2
     bottom = z - DEPTH
     profile = [(-x, -z), (x, -z), (x, z), (w, z), (w, bottom), (-w, bottom), (-w, z), (-x, z)]
@@ -68,11 +68,11 @@ def in_fissured_block(points: np.ndarray, width: float) -> np.ndarray:
     return in_block & ~in_fissure
 
 
-# --- how surfaces are spoilt ------------------------------------------------------------------
+# --- damage -----------------------------------------------------------------------------------
 
 
 def joined(*surfaces: SurfaceMesh) -> SurfaceMesh:
-    """All triangles in one mesh."""
+    """Join all triangles in one mesh."""
     starts = np.cumsum([0] + [len(s.vertices) for s in surfaces])
     faces = np.vstack([s.faces + k for s, k in zip(surfaces, starts, strict=False)])
     return SurfaceMesh(np.vstack([s.vertices for s in surfaces]), faces)
@@ -83,14 +83,14 @@ def inside_out(surface: SurfaceMesh) -> SurfaceMesh:
 
 
 def with_hole(surface: SurfaceMesh, centre: np.ndarray, share: float) -> SurfaceMesh:
-    """Without the triangles nearest to a point, that share of the area."""
+    """Remove the triangles nearest to a point, up to a fraction of the area."""
     order = np.argsort(np.linalg.norm(surface.vertices[surface.faces].mean(1) - centre, axis=1))
     area = igl.doublearea(surface.vertices, surface.faces.astype(np.int64))[order]
     return SurfaceMesh(surface.vertices, surface.faces[order[np.cumsum(area) > share * area.sum()]])
 
 
 def soup(surface: SurfaceMesh, crack: float = 2e-5) -> SurfaceMesh:
-    """Every triangle on its own, its corners displaced: hairline cracks everywhere."""
+    """Separate all triangles and displace their corners: hairline cracks everywhere."""
     corners = np.array(surface.vertices[surface.faces]).reshape(-1, 3)
     corners += crack * np.random.default_rng(1).standard_normal(corners.shape)
     return SurfaceMesh(corners, np.arange(len(corners)).reshape(-1, 3))
@@ -104,21 +104,21 @@ def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
 
 
 def written(folder: Path, surface: SurfaceMesh, scale: float = 1e3) -> Path:
-    """As an OBJ file, by default in millimetres."""
+    """Write a surface as an OBJ file, by default in millimetres."""
     return write_obj(folder / "organ.obj", scale * surface.vertices, surface.faces)
 
 
-# --- what is asked ----------------------------------------------------------------------------
+# --- measures ---------------------------------------------------------------------------------
 
 
 def signed_volume(surface: SurfaceMesh) -> float:
-    """Integral of the winding number, by the divergence theorem [m3]."""
+    """Integrate the winding number by the divergence theorem [m3]."""
     a, b, c = surface.vertices[surface.faces].transpose(1, 0, 2)
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
 def bodies_and_handles(surface: SurfaceMesh) -> tuple[int, int]:
-    """Components of a closed surface, and their genus, V - E + F = 2 components - 2 genus."""
+    """Count components and genus of a closed surface: V - E + F = 2 components - 2 genus."""
     used, faces = np.unique(surface.faces, return_inverse=True)
     faces = faces.reshape(-1, 3)
     sides = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
@@ -129,19 +129,19 @@ def bodies_and_handles(surface: SurfaceMesh) -> tuple[int, int]:
 
 
 def steepest(grid: DistanceGrid) -> float:
-    """Largest change between neighbours over their distance: at most 1 for a distance."""
+    """Return the largest difference between neighbours per spacing: at most 1 for a distance."""
     return max(float(np.abs(np.diff(grid.values, axis=k)).max()) for k in range(3)) / grid.spacing
 
 
 def gradient_length(points: np.ndarray, surface: SurfaceMesh, step: float = 1e-6) -> np.ndarray:
-    """|grad phi| of the signed distance itself, by central differences of a micrometre."""
+    """Return |grad phi| of the signed distance by central differences of a micrometre."""
     probes = points[:, None] + step * np.vstack([np.eye(3), -np.eye(3)])
     phi = surface.skin.signed_distance(probes.reshape(-1, 3)).reshape(-1, 2, 3)
     return np.linalg.norm((phi[:, 0] - phi[:, 1]) / (2 * step), axis=1)
 
 
 def refused(path: Path, *words: str, **options: Any) -> str:
-    """What the door says of a file that it refuses: one line that holds all the words."""
+    """Return the one-line message that refuses a file, and check the words in it."""
     with pytest.raises(SurfaceError) as caught:
         read_surface(path, **options)
     message = str(caught.value)

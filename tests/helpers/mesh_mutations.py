@@ -1,4 +1,4 @@
-"""Surface files, and what may happen to them on the way: structure, numbers and bytes.
+"""Mutations of surface files: structure, numbers and bytes.
 
 Each mutation is a function of a seed alone, so that its name says how to make the file again.
 """
@@ -31,13 +31,13 @@ class Soup:
 
 
 def pristine() -> Soup:
-    """A ball of 60 mm."""
+    """Return a ball of 60 mm."""
     vertices, faces = ball(60, RADIUS)
     return Soup(vertices, faces)
 
 
 def mutant(seed: int) -> tuple[str, bytes]:
-    """Suffix and content of a file that something has happened to."""
+    """Return suffix and content of a mutated file."""
     rng = np.random.default_rng(seed)
     kind = SUFFIXES[seed % len(SUFFIXES)]
     content = encode(_altered(rng), kind)
@@ -52,7 +52,7 @@ def mutant(seed: int) -> tuple[str, bytes]:
 
 
 def altered_soup(seed: int) -> Soup:
-    """Numbers of a surface to which something has happened; the file of that seed begins so."""
+    """Mutate the numbers of a surface; the mutant of that seed starts from it."""
     return _altered(np.random.default_rng(seed))
 
 
@@ -65,7 +65,7 @@ def _altered(rng: np.random.Generator) -> Soup:
 
 
 def encode(soup: Soup, kind: str, words: str = "ball") -> bytes:
-    """A surface in a file format, with some words where the format has a comment."""
+    """Encode a surface in a file format, with some words in its comment or header."""
     return _ENCODERS[kind](soup, words)
 
 
@@ -161,7 +161,7 @@ def _vtp_raw(soup: Soup, words: str) -> bytes:
 
 
 def _nifti(_: Soup, words: str) -> bytes:
-    """A label map of a ball; it has no surface that something could have happened to."""
+    """Encode a label map of a ball: this format holds no surface."""
     import nibabel
 
     axis = np.arange(-70.0, 71.0, 10.0)
@@ -187,7 +187,7 @@ _ENCODERS: dict[str, Callable[[Soup, str], bytes]] = {
 }
 SUFFIXES = tuple(_ENCODERS)
 
-# --- what happens to surfaces -------------------------------------------------------------------
+# --- mutations of surfaces ------------------------------------------------------------------------
 
 
 def _bad_coordinates(rng: np.random.Generator, soup: Soup) -> Soup:
@@ -206,7 +206,7 @@ def _bad_indices(rng: np.random.Generator, soup: Soup) -> Soup:
 
 
 def _non_manifold(rng: np.random.Generator, soup: Soup) -> Soup:
-    """More triangles across the ball, some of them again or without an area."""
+    """Add triangles across the ball, some repeated or without area."""
     extra = rng.integers(0, len(soup.vertices), (int(rng.integers(1, 40)), 3))
     return Soup(soup.vertices, np.vstack([soup.faces, extra]))
 
@@ -224,11 +224,11 @@ def _flat(rng: np.random.Generator, soup: Soup) -> Soup:
 
 _OF_SOUP = (_bad_coordinates, _bad_indices, _non_manifold, _holes, _flat)
 
-# --- what happens to texts ----------------------------------------------------------------------
+# --- mutations of texts ---------------------------------------------------------------------------
 
 
 def _words(rng: np.random.Generator, raw: bytearray) -> bytearray:
-    """Some words of a text become others."""
+    """Replace some words of a text."""
     lines = raw.split(b"\n")
     for at in rng.integers(0, len(lines), int(rng.integers(1, 6))):
         words = lines[at].split(b" ")
@@ -238,7 +238,7 @@ def _words(rng: np.random.Generator, raw: bytearray) -> bytearray:
 
 
 def _counts(rng: np.random.Generator, raw: bytearray) -> bytearray:
-    """A count in the header of a text becomes another; binary ones where STL has its own."""
+    """Change a count in a header: as text, or binary as in STL."""
     count = _COUNTS[int(rng.integers(0, len(_COUNTS)))]
     if raw.startswith(b"binary"):
         raw[80:84] = struct.pack("<I", count % 2**32)
@@ -262,7 +262,7 @@ _OF_TEXT = (_words, _counts, _counts, _line_ends)
 
 
 def _nifti_header(rng: np.random.Generator, raw: bytearray) -> bytearray:
-    """Dimensions, type, start of the data, scale or affine of a volume become others."""
+    """Change dimensions, type, start of the data, scale or affine of a volume."""
     fields = (
         [(40 + 2 * k, "<h") for k in range(8)]
         + [(70, "<h"), (72, "<h"), (108, "<f"), (112, "<f"), (116, "<f"), (0, "<i"), (252, "<h")]

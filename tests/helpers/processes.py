@@ -1,4 +1,4 @@
-"""Other processes, as the kernel tells of them."""
+"""State of other processes, as the kernel reports it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def state_of(pid: int) -> str:
-    """Letter of a process's state, as ps shows it: T for stopped; Z, too, where there is none."""
+    """Return the letter of a process's state as in ps, e.g. T for stopped; Z if there is none."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:
@@ -14,5 +14,5 @@ def state_of(pid: int) -> str:
 
 
 def has_ended(pid: int) -> bool:
-    """Whether a process has ended, though its parent may not have asked how."""
+    """Return whether a process has ended, even if its parent has not yet waited for it."""
     return state_of(pid) in "ZX"

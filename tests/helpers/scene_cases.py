@@ -1,4 +1,4 @@
-"""What the tests of scenes share: a refusal in one line, the scenes that come along."""
+"""Shared by the tests of scenes: one-line refusals, and the scenes shipped with the project."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PRONY = Viscoelasticity(g=(0.3, 0.25), tau=(0.5, 8.0))
 
 
 def refusal(text: str, line: int | None = None) -> str:
-    """What a text is refused with, after ``x.yaml:LINE: ``; always one line."""
+    """Return the message that refuses a text, after ``x.yaml:LINE: ``; always one line."""
     with pytest.raises(SceneError) as caught:
         parse_scene(text, "scenes/x.yaml")
     message = str(caught.value)

@@ -1,4 +1,4 @@
-"""The dent that a cloud shows near a tip, beside that of a half-space."""
+"""The dent that a cloud shows near a tip, compared with that of a half-space."""
 
 from __future__ import annotations
 
@@ -20,26 +20,27 @@ from tests.helpers.contact import data_of
 from tests.helpers.tool_motion import press
 
 SPHERE, DEPTH = Tip("sphere", 3e-3), 2e-3
-ASIDE = ((0.0, 0.0), (3e-3, 2e-3), (-9e-3, 7e-3), (5e-3, 5e-3))  # of the middle of a box [m]
+# offsets from the middle of a box [m]
+ASIDE = ((0.0, 0.0), (3e-3, 2e-3), (-9e-3, 7e-3), (5e-3, 5e-3))
 END = REACH * PATCH_RADIUS
 
 
 def displaced(
     data: ContactData, tips: Sequence[Tip], places: np.ndarray, up: np.ndarray, depth: float
 ) -> np.ndarray:
-    """Displacements of the cloud under tips at some depth, after an approach, (n, 3) [m]."""
+    """Press tips to a depth from outside and return the cloud's displacements, (n, 3) [m]."""
     press(data, tips, places, up, depth)
     return np.asarray(data.out.cloud[:, 3:], float)
 
 
 def with_patch_dents(data: ContactData) -> ContactData:
-    """The same model, showing the dents of patches: no point is near a tip."""
+    """Return the same model with dents of patches only: no point is near a tip."""
     arrays = data.model.arrays
     return data_of(arrays._replace(dent=arrays.dent._replace(start=0 * arrays.dent.start)))
 
 
 def tip_dent(tip: Tip, depth: float, a: float, rho: float) -> float:
-    """u [m] of a half-space under a tip with a contact radius, by dimensionality reduction."""
+    """Return u [m] of a half-space under a tip, by dimensionality reduction; a: contact radius."""
     end = min(a, rho)
 
     def spring(angle: float) -> float:
@@ -51,12 +52,12 @@ def tip_dent(tip: Tip, depth: float, a: float, rho: float) -> float:
 
 
 def sneddon_dent(rho: np.ndarray) -> np.ndarray:
-    """Of the sphere at the depth, on a half-space (Segedin, Sneddon) [m]."""
+    """Return the displacement of a half-space under the sphere (Segedin, Sneddon) [m]."""
     radius = SPHERE.radius
     a = brentq(lambda a: a * np.arctanh(a / radius) - DEPTH, 1e-6, radius * (1.0 - 1e-9))
     return np.array([tip_dent(SPHERE, DEPTH, a, each) for each in rho])
 
 
 def finer(v: Vademecum, times: int = 2) -> Vademecum:
-    """The same with every triangle of the boundary split into four, so many times."""
+    """Split every boundary triangle into four, repeatedly, and return the finer vademecum."""
     return replace(v, display=display_of(v.mesh, igl.upsample(*boundary(v.mesh), times)))

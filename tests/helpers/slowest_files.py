@@ -1,4 +1,4 @@
-"""Ends a run with its slowest files, so that growth is seen before it hurts."""
+"""Report of the slowest test files at the end of a run."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections import Counter
 
 import pytest
 
-SHOWN, LEAST = 15, 5.0  # files, and those below so many seconds not
+SHOWN, LEAST = 15, 5.0  # number of files, and time below which none is shown [s]
 
 
 class SlowestFiles:
-    """Adds up set-up, call and tear-down of all tests of a file, on whichever worker."""
+    """Sums of set-up, call and tear-down over all tests of a file, on any worker."""
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         seconds = Counter[str]()

@@ -1,4 +1,4 @@
-"""Bounds of time that hold on a busy machine, too."""
+"""Time limits that also hold on a busy machine."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from contextlib import contextmanager
 from typing import Any
 
 _WORK = 0.2  # processor time of one measurement [s]
-_AGAIN = 5.0  # seconds between two: who waits has other things to do
+_AGAIN = 5.0  # seconds between two measurements, so that waiting costs little
 
 
 def slowness() -> float:
-    """How many times longer work takes than on a machine that nothing else uses.
+    """Return how many times longer work takes than on an idle machine.
 
-    By a fixed amount of work here and now, and by the load of the last minute.
+    It measures a fixed amount of work now, and reads the load of the last minute.
     """
     begin, used = time.monotonic(), time.thread_time()
     while time.thread_time() - used < _WORK:
@@ -26,14 +26,14 @@ def slowness() -> float:
 
 
 class Deadline:
-    """An end of waiting, ``seconds`` from now on a machine that nothing else uses."""
+    """Time limit of ``seconds`` from now on an idle machine."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds, self._begin = seconds, time.monotonic()
         self._end = self._begin + seconds
 
     def __bool__(self) -> bool:
-        """Whether it has passed."""
+        """Return whether the limit has passed."""
         if time.monotonic() < self._end:
             return False
         took = time.monotonic() - self._begin
@@ -45,14 +45,14 @@ class Deadline:
 
 @contextmanager
 def within(seconds: float) -> Iterator[None]:
-    """Fails if its body takes longer than ``seconds`` of a machine that nothing else uses."""
+    """Fail if the body takes longer than ``seconds`` of an idle machine."""
     passed = Deadline(seconds)
     yield
     assert not passed, f"took longer than {seconds:g} s"
 
 
 def wait_until(reached: Callable[[], bool], seconds: float, missed: str = "not reached") -> None:
-    """Wait for something that takes at most ``seconds`` of such a machine."""
+    """Wait for a condition that takes at most ``seconds`` on an idle machine."""
     passed = Deadline(seconds)
     while not reached():
         assert not passed, f"{missed} within {seconds:g} s"
@@ -60,7 +60,7 @@ def wait_until(reached: Callable[[], bool], seconds: float, missed: str = "not r
 
 
 def end_of(process: subprocess.Popen[Any], seconds: float) -> int:
-    """Exit code of a process that has to end within ``seconds`` of such a machine, or is killed."""
+    """Return the exit code of a process; kill it after ``seconds`` of an idle machine."""
     try:
         wait_until(lambda: process.poll() is not None, seconds, "did not end")
     finally:

@@ -1,7 +1,7 @@
-"""The smallest vademecum and atlas that the loaders take: every array is there, none is large.
+"""The smallest vademecum and atlas that the loaders accept: all arrays present, none large.
 
-A mutation of such a file hits its structure as often as its numbers, and thousands are read in a
-minute. The organ is a ball; what no formula of the loader depends on is random.
+A mutation hits the structure of such a file as often as its numbers, and thousands are read in a
+minute. The organ is a ball; numbers that no loader's formula uses are random.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ RANK = 3
 
 
 def ball(n: int = 24, radius: float = RADIUS) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) [m] on a sphere, spread evenly, and outward faces (2 n - 4, 3)."""
+    """Return vertices (n, 3) [m] spread evenly on a sphere, and outward faces (2 n - 4, 3)."""
     k = np.arange(n) + 0.5
     z, turn = 1.0 - 2.0 * k / n, np.pi * (1.0 + 5.0**0.5) * k
     flat = np.sqrt(1.0 - z**2)
@@ -47,7 +47,7 @@ def ball(n: int = 24, radius: float = RADIUS) -> tuple[np.ndarray, np.ndarray]:
 
 
 def small_vademecum(parametric: bool = False, large: bool = False) -> Vademecum:
-    """A ball of tetrahedra about its centre, all of its faces accessible but one."""
+    """Build a ball of tetrahedra about its centre, accessible on all faces but one."""
     rng = np.random.default_rng(0)
     points, faces = ball()
     n, n_vertices = len(points), len(points) + 1
@@ -86,7 +86,7 @@ def small_vademecum(parametric: bool = False, large: bool = False) -> Vademecum:
 
 
 def small_atlas(n_anatomies: int = 2) -> tuple[Frame, list[WholeAnatomy]]:
-    """Balls of some sizes, with responses, on a grid of 27 points."""
+    """Build balls of several sizes, with responses, on a grid of 27 points."""
     rng = np.random.default_rng(1)
     points, faces = ball()
     vertices = np.vstack([points, np.zeros(3)])
@@ -126,7 +126,7 @@ def _field(rng: np.random.Generator, n_dofs: int, n_loads: int, rank: int) -> Se
 
 
 def _blocks(n_positions: int) -> LocalBlocks:
-    """Blocks between each position and itself, and the next one; symmetric."""
+    """Build blocks that couple each position with itself and with the next; symmetric."""
     start = np.append(np.arange(0, 2 * n_positions, 2), 2 * n_positions - 1)
     target = np.repeat(np.arange(n_positions), 2)[:-1]
     target[1::2] += 1
@@ -138,7 +138,7 @@ def _blocks(n_positions: int) -> LocalBlocks:
 def _block_field(
     rng: np.random.Generator, region: np.ndarray, n_loads: int, n_shared: int
 ) -> BlockField:
-    """Two regions, of two modes and of one, in two blocks of two modes each."""
+    """Build two regions, with two modes and one, in two blocks of two modes each."""
     count = n_shared + np.array([0, 2, 1], np.int32)
     load = 1e-4 * rng.normal(size=(len(region), n_loads, n_shared + 2)).astype(np.float32)
     load[region == 1, :, -1] = 0.0

@@ -1,5 +1,6 @@
-"""A soft box for large deformation, and what is asked of every path through it: which steps were
-taken, whether an element turned over, whether the work of the force is stored.
+"""A soft box for large deformation, and checks of every path through it.
+
+The checks: steps taken, elements turned over, work of the force against the stored energy.
 """
 
 from __future__ import annotations
@@ -31,18 +32,18 @@ def box(material: HyperelasticMaterial, n: int = 2) -> Hyperelasticity:
 
 
 def stretched(problem: Hyperelasticity, s: float) -> np.ndarray:
-    """Displacement of y -> s y."""
+    """Return the displacement of y -> s y."""
     return (nodes_of(problem) * [0.0, s - 1.0, 0.0]).ravel()
 
 
 def bent(problem: Hyperelasticity) -> np.ndarray:
-    """A displacement of up to 40 mm, zero at the clamp y = 0."""
+    """Return a displacement of up to 40 mm that vanishes at the clamp y = 0."""
     x, y, z = 10.0 * nodes_of(problem).T
     return (0.03 * np.stack([y**2, 0.5 * y * (1.0 - x), y * z], axis=1)).ravel()
 
 
 def held(problem: Hyperelasticity, dofs: np.ndarray) -> np.ndarray:
-    """A unit load for each of these degrees of freedom, shape (3 n_nodes, n)."""
+    """Return a unit load for each of these degrees of freedom, shape (3 n_nodes, n)."""
     unit = np.zeros((3 * problem.n_nodes, len(dofs)))
     unit[dofs, np.arange(len(dofs))] = 1.0
     return unit
@@ -51,7 +52,7 @@ def held(problem: Hyperelasticity, dofs: np.ndarray) -> np.ndarray:
 def followed(
     problem: Hyperelasticity, loads: np.ndarray, motions: Sequence[np.ndarray]
 ) -> Iterator[State]:
-    """States after one imposed motion after the other; press starts from rest each time."""
+    """Solve one imposed motion after the other; ``press`` starts each from rest."""
     displacement = np.zeros(3 * problem.n_nodes)
     for motion in motions:
         newton = _DepthControl(problem, loads[problem.free], motion, NewtonRule())
@@ -63,7 +64,7 @@ def followed(
 
 @contextmanager
 def accepted_steps() -> Iterator[list[State]]:
-    """Every step that Newton's method accepts, not only those that are returned."""
+    """Record every step that Newton's method accepts, also those that it does not return."""
     states: list[State] = []
     advance = _Newton.advance
 
@@ -77,7 +78,7 @@ def accepted_steps() -> Iterator[list[State]]:
 
 
 def least_det(problem: Hyperelasticity, displacement: np.ndarray) -> float:
-    """Smallest det F at quadrature points and corners, not by the code's own formulas.
+    """Return the smallest det F at quadrature points and corners, by formulas of its own.
 
     Along the edge from corner i to j, x = X + u changes by 4 x_ij - 3 x_i - x_j at i.
     """
@@ -96,9 +97,9 @@ def least_det(problem: Hyperelasticity, displacement: np.ndarray) -> float:
 
 
 def stored_and_done(depths: np.ndarray, forces: np.ndarray) -> tuple[np.ndarray, float]:
-    """Work of the force up to each depth, by a spline, and how wrong that may be.
+    """Integrate the force over the depth by a spline; return the work and its error bound.
 
-    As far off as every second state would be, which is an upper bound for a rule of fourth order.
+    The error bound is the change when every second state is dropped: the rule is of fourth order.
     """
     work = CubicSpline(depths, forces).antiderivative()(depths)
     kept = np.unique([0, *range(len(depths) - 1, 0, -2)])
@@ -107,7 +108,7 @@ def stored_and_done(depths: np.ndarray, forces: np.ndarray) -> tuple[np.ndarray,
 
 
 def carried(states: Iterator[State]) -> tuple[list[State], str]:
-    """The states up to where equilibrium is lost, and what is said then; "" if it is not."""
+    """Return the states before equilibrium is lost, and the error message, "" if none."""
     found: list[State] = []
     try:
         found.extend(states)

@@ -21,7 +21,7 @@ CONTRAST = Coordinate("contrast", 0.5, 10.0, 3)
 
 
 def ball(center: np.ndarray, radius: float) -> SurfaceMesh:
-    """A sphere: an octahedron whose faces were divided three times."""
+    """Mesh a sphere: an octahedron whose faces were divided three times."""
     points = [
         np.array(p, float)
         for p in [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
@@ -59,7 +59,7 @@ def soft_organ() -> Vademecum:
 
 @cached_on_disk
 def organ_on_springs() -> Vademecum:
-    """Over the stiffness of its bare area, which alone holds it; loads at vertices alone."""
+    """Build over the stiffness of the bare area, the only support; loads at vertices alone."""
     options = OrganOptions(
         n_displayed=0,
         n_vertices=450,
@@ -74,7 +74,7 @@ def organ_on_springs() -> Vademecum:
 
 @cached_on_disk
 def cut_organ() -> Vademecum:
-    """Cut beside a tumour from the front backwards, nine tenths of the way; loads at vertices."""
+    """Build over a cut beside a tumour, from the front 90 % of the way back; loads at vertices."""
     x, y, z = map(float, phantom_liver(12e-3).vertices.mean(axis=0))
     options = OrganOptions(
         n_vertices=450,

@@ -1,7 +1,7 @@
-"""Files of tests that measure time run when no other file does, and last.
+"""Exclusive turns for test files that measure time: they run last, and alone.
 
 With several workers of pytest-xdist, a file with a test marked ``timing`` waits until the other
-workers are between two files, and they wait for its end, the teardown of its fixtures included.
+workers are between two files. They wait for its end, the teardown of its fixtures included.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ def is_timing(item: pytest.Item) -> bool:
 
 
 class Turns:
-    """Holds a lock over each file of tests: shared, or exclusive if one of them measures time."""
+    """Lock held over each test file: shared, or exclusive if a test of it measures time."""
 
     def __init__(self) -> None:
         self._timing: set[Path] = set()
         self._held: IO[Any] | None = None
 
-    @pytest.hookimpl(trylast=True)  # of those that are selected
+    @pytest.hookimpl(trylast=True)  # after deselection
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
         self._timing = {item.path for item in items if is_timing(item)}
         items.sort(key=lambda item: item.path in self._timing)
@@ -44,7 +44,7 @@ class Turns:
 
 
 def _lock(config: pytest.Config, exclusive: bool) -> IO[Any]:
-    """The door is held by who waits, so that those who come later cannot keep it waiting."""
+    """Hold the door while waiting, so that later processes cannot keep the waiting one out."""
     run = getattr(config, "workerinput", {}).get("testrunuid", os.getpid())
     path = Path(tempfile.gettempdir(), f"avatar-tests-{run}")
     held = path.with_suffix(".lock").open("w")

@@ -1,4 +1,4 @@
-"""Tips of every shape that there is."""
+"""Tips of every shape."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ USUAL = {"half_angle": 30.0, "rounding": 1.5e-3}
 
 
 def used_by(shape: str) -> list[str]:
-    """Names of the numbers that a shape needs beside its radius."""
+    """Return the names of the numbers that a shape needs beside its radius."""
     return [name for name, shapes in USED_BY.items() if shape in shapes]
 
 
 def one_of_each() -> list[Tip]:
-    """A tip of 4 mm of each shape."""
+    """Return a tip of 4 mm of each shape."""
     return [
         Tip(shape, 4e-3, **{name: USUAL[name] for name in used_by(shape)})
         for shape in get_args(Shape)

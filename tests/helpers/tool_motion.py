@@ -1,4 +1,4 @@
-"""Tools that move over an organ: their forces, the work they do, and the energy stored."""
+"""Tools that move over an organ: forces, work and stored energy."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ AWAY = np.full(3, FAR_AWAY)
 
 
 class Motion(NamedTuple):
-    """What happened along a path of n periods.
+    """Records along a path of n periods.
 
-    force : ndarray, shape (n, n_tools, 3), on the tools [N]
+    force : ndarray, shape (n, n_tools, 3), force on the tools [N]
     status : ndarray, shape (n, n_tools)
-    work : ndarray, shape (n,), done by the tools so far, by the trapezoidal rule [J]
-    energy : ndarray, shape (n,), stored in the organ [J]
+    work : ndarray, shape (n,), work of the tools so far, by the trapezoidal rule [J]
+    energy : ndarray, shape (n,), energy stored in the organ [J]
     """
 
     force: np.ndarray
@@ -32,7 +32,7 @@ class Motion(NamedTuple):
 
 
 def follow(data: ContactData, path: np.ndarray) -> Motion:
-    """Move the tools along a path, shape (n, n_tools, 3), one period each."""
+    """Move the tools along a path, shape (n, n_tools, 3), one period for each row."""
     force, status = np.zeros(path.shape), np.zeros(path.shape[:2], int)
     energy = np.zeros(len(path))
     for k, tips in enumerate(path):
@@ -45,19 +45,19 @@ def follow(data: ContactData, path: np.ndarray) -> Motion:
 
 
 def line(start: np.ndarray, end: np.ndarray, spacing: float) -> np.ndarray:
-    """A straight path of one tip, both ends included, shape (n, 1, 3)."""
+    """Return a straight path of one tip, both ends included, shape (n, 1, 3)."""
     n = max(2, int(np.ceil(np.linalg.norm(end - start) / spacing)) + 1)
     return np.linspace(start, end, n)[:, None, :]
 
 
 def refined(corners: np.ndarray, n: int) -> np.ndarray:
-    """The path from corner to corner, every leg in n steps, shape (n_steps, 3)."""
+    """Return the path from corner to corner, n steps for each leg, shape (n_steps, 3)."""
     legs = [np.linspace(a, b, n, endpoint=False) for a, b in pairwise(corners)]
     return np.concatenate([*legs, corners[-1:]])
 
 
 def polygon(corners: Sequence[np.ndarray], spacing: float) -> np.ndarray:
-    """Straight lines of one tip from corner to corner, shape (n, 1, 3)."""
+    """Return straight lines of one tip from corner to corner, shape (n, 1, 3)."""
     return np.concatenate([line(a, b, spacing) for a, b in pairwise(corners)])
 
 
@@ -68,9 +68,9 @@ def press(
     normals: np.ndarray,
     depths: float | Sequence[float],
 ) -> np.ndarray:
-    """Press tips into an organ at rest, coming from outside; the forces along the normals [N].
+    """Press tips from outside into an organ at rest; return the forces along the normals [N].
 
-    points, normals : of the surface, shape (n_tools, 3)
+    points, normals : points of the surface and their normals, shape (n_tools, 3)
     """
     data.reset()
     height = np.array([tip.offset for tip in tips])
@@ -83,7 +83,7 @@ def press(
 def energy_slope(
     data: ContactData, tips: np.ndarray, h: float = 1e-6, orientations: np.ndarray | None = None
 ) -> np.ndarray:
-    """Gradient of the stored energy by the places of all tips, shape (n_tools, 3) [N]."""
+    """Differentiate the stored energy by the positions of all tips, shape (n_tools, 3) [N]."""
     slope = np.empty(tips.shape)
     for t, d in np.ndindex(*tips.shape):
         energy = []
@@ -97,6 +97,6 @@ def energy_slope(
 
 
 def load_positions(data: ContactData) -> tuple[np.ndarray, np.ndarray]:
-    """Load positions that carry the first tip, and their weights."""
+    """Return the load positions that carry the first tip, and their weights."""
     n = data.state.n_nodes[0]
     return data.state.nodes[0, :n], data.state.weight[0, :n, 0]

@@ -20,14 +20,14 @@ DEPTH = 5e-3
 
 
 def path_over(organ: Vademecum, n: int) -> np.ndarray:
-    """Pushes at n places, the tool far away between them, shape (periods, 3)."""
+    """Return pushes at n places, the tool far away between them, shape (periods, 3)."""
     parts = [push(organ, RADIUS, DEPTH, 120, j) for j in starts_apart(organ, n)]
     away = np.full((5, 3), FAR_AWAY)
     return np.concatenate([row for part in parts for row in (away, part)] + [away])
 
 
 def felt(organ: Vademecum, tips: np.ndarray) -> np.ndarray:
-    """Force on the tip, shape (n, 3)."""
+    """Return the computed force on the tip, shape (n, 3)."""
     data = prepare(organ, (SPHERE,), cloud="off")
     force = np.empty(tips.shape)
     for k, tip in enumerate(tips):

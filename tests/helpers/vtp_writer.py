@@ -1,4 +1,4 @@
-"""VTK's XML files of polygonal data, in each of their encodings, for tests."""
+"""VTK XML files of polygonal data, in every encoding, for tests."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ COMPRESSORS = {
     "vtkZLibDataCompressor": zlib.compress,
     "vtkLZMADataCompressor": lzma.compress,
 }
-_BLOCK = 1000  # bytes of a compressed one
+_BLOCK = 1000  # bytes of a compressed block
 _NAMES = {"f": "Float", "i": "Int", "u": "UInt"}
 
 
 class VtpFile:
-    """A file of pieces: their points, their polygons and strips, and what it says of its axes."""
+    """File with pieces (points, polygons, strips) and a statement about its axes."""
 
     def __init__(
         self, encoding: str = "ascii", compressor: str = "", big: bool = False, header: str = "u4"
@@ -83,7 +83,7 @@ class VtpFile:
         return f'{begin} offset="{offset}"/>'
 
     def _packed(self, data: bytes) -> bytes:
-        """Sizes and bytes; in base64 the sizes stand alone where the bytes are compressed."""
+        """Return sizes and bytes; in base64, sizes are encoded apart from compressed bytes."""
         compress = COMPRESSORS[self._compressor]
         if compress is None:
             return self._encoded(np.array([len(data)], self._header).tobytes() + data)

@@ -1,3 +1,4 @@
-"""Measures a whole cell of real processes with a scripted tool at 1 kHz and a viewer of clouds:
-periods, latencies, memory, files and threads.
+"""Measurements of a whole cell of real processes, with a scripted tool at 1 kHz.
+
+They give periods, latencies, memory, files and threads.
 """

@@ -1,4 +1,4 @@
-"""A loop that only sleeps, or sleeps and works: the best that any program gets on this machine.
+"""A loop that only sleeps, or sleeps and works: the best timing that this machine allows.
 
 Run as ``python -m avatar_ros.bench.bare_loop SECONDS PRIORITY [WORK]``; prints its periods as JSON.
 """
@@ -18,6 +18,7 @@ _CALIBRATIONS = 300
 
 
 def main() -> int:
+    """Run the loop with the arguments of the command line; return the exit code."""
     seconds, priority = float(sys.argv[1]), int(sys.argv[2])
     work = float(sys.argv[3]) if len(sys.argv) > 3 else 0.0
     granted = realtime.claim(priority)
@@ -29,9 +30,9 @@ def main() -> int:
 
 
 def periods(seconds: float, work: float = 0.0, period: float = 1e-3) -> np.ndarray:
-    """From start to start of a loop that sleeps until it is due and then works; (n,) [s].
+    """Return the periods of a loop that sleeps until it is due and then works, shape (n,) [s].
 
-    work : what it computes takes as long as this where nothing disturbs it [s]
+    work : computing time per period on an undisturbed core [s]
     """
     step = round(period * 1e9)
     starts = np.zeros(max(2, round(seconds / period)), dtype=np.int64)
@@ -40,7 +41,7 @@ def periods(seconds: float, work: float = 0.0, period: float = 1e-3) -> np.ndarr
     n = _blocks(work, block, product)
     due = time.monotonic_ns()
     for i in range(len(starts)):
-        due = max(due + step, time.monotonic_ns())  # what is lost is not caught up on
+        due = max(due + step, time.monotonic_ns())  # lost time is not caught up
         realtime.sleep_until(due)
         starts[i] = time.monotonic_ns()
         for _ in range(n):
@@ -49,7 +50,7 @@ def periods(seconds: float, work: float = 0.0, period: float = 1e-3) -> np.ndarr
 
 
 def _blocks(work: float, block: np.ndarray, product: np.ndarray) -> int:
-    """How many products take as long as ``work`` [s], by their median."""
+    """Return how many products take as long as ``work`` [s], by their median."""
     if work <= 0.0:
         return 0
     times = np.zeros(_CALIBRATIONS)

@@ -1,10 +1,10 @@
-"""Does this machine keep 1 kHz? Measures a whole cell of real processes over real DDS.
+"""Benchmark of a whole cell of real processes over real DDS: does this machine keep 1 kHz?
 
 The cell consists of loader, contact node, a palpating tool, a cloud viewer and, on request, a
-slider of the material. A loop that only sleeps runs beside it and shows which periods the machine
-itself misses. After it, alone, runs one that also computes as long as the contact node does: any
-program that does as much misses what this one misses. The memory, files and threads of every
-process are compared between begin and end, so a run of ten minutes is a soak test.
+slider of the material. A loop that only sleeps runs beside them and shows which periods the machine
+itself misses. Then a second bare loop runs alone and computes as long as the contact node does: any
+program with that load misses as many periods. The memory, files and threads of every process are
+compared between begin and end, so a run of ten minutes is a soak test.
 ``avatar bench cell`` and ``avatar demo`` run it as
 ``python -m avatar_ros.bench.cell VADEMECUM SECONDS``.
 """
@@ -39,11 +39,11 @@ PERIOD = 1e-3  # [s]
 ON_TIME = 1.5e-3  # longest period that is on time [s]
 PRIORITY = 80  # of contact node, tool and sleeping loop in the real-time mode
 _START_TIMEOUT = 120.0  # compilation included [s]
-_WARM = 0.1  # part of a run before the first comparison of the processes
-_LAST = 1.5  # before the end, while the tool still runs, for the second one [s]
+_WARM = 0.1  # fraction of a run before the first comparison of the processes
+_LAST = 1.5  # time before the end, with the tool still running, of the second comparison [s]
 _ALONE = 20.0  # longest run of the loop that works alone [s]
-_STOP_TIMEOUT = 20.0  # a node ends within 2 s, but not where it gets a tenth of a core [s]
-_DOMAINS = range(1, 102)  # of DDS, those that work on every platform
+_STOP_TIMEOUT = 20.0  # a node ends within 2 s, or later with a tenth of a core [s]
+_DOMAINS = range(1, 102)  # DDS domain ids that work on every platform
 
 
 class CellError(AvatarError):
@@ -60,12 +60,17 @@ def run_cell(
 ) -> CellReport:
     """Measure a cell with real-time priority and without, ``seconds`` each.
 
-    tip_radius : of the sphere that palpates [m]
-    changes : of the material [Hz]
+    Parameters
+    ----------
+    tip_radius : float
+        Radius of the palpating sphere [m].
+    changes : float
+        Rate at which the material changes [Hz].
 
     Raises
     ------
-    CellError : a process failed; the message holds its last line
+    CellError
+        If a process failed; the message holds the last line of its standard error.
     """
     path = Path(vademecum_path).resolve()
     if not path.is_file():
@@ -134,7 +139,7 @@ def _measure(
 
 
 def _periods(loop: Module, seconds: float) -> np.ndarray:
-    """What a bare loop printed [s]."""
+    """Return the periods that a bare loop printed [s]."""
     said, _ = loop.communicate(timeout=seconds + _START_TIMEOUT)
     if loop.returncode != 0:
         raise CellError(f"the bare loop failed: {loop.last_line()}")
@@ -142,7 +147,7 @@ def _periods(loop: Module, seconds: float) -> np.ndarray:
 
 
 def _windows(round_trips: RoundTrips, view: dict[str, Any]) -> list[dict[str, Any]]:
-    """The contact node's statistics of the measured part."""
+    """Return the contact node's statistics of the measured part."""
     begin, end = float(round_trips.begin), float(round_trips.end)
     found = [
         w
@@ -155,7 +160,7 @@ def _windows(round_trips: RoundTrips, view: dict[str, Any]) -> list[dict[str, An
 
 
 def _growths(seconds: float, processes: dict[str, Module]) -> tuple[FootprintGrowth, ...]:
-    """The growth of all processes over a run that begins now; returns shortly before its end."""
+    """Measure how much all processes grow over a run; return shortly before its end."""
     begin = time.monotonic()
     pids = {name: process.pid for name, process in processes.items()}
     helpers = footprint.children(pids["contact"])
@@ -165,7 +170,7 @@ def _growths(seconds: float, processes: dict[str, Module]) -> tuple[FootprintGro
         first = footprints(pids)
         time.sleep(max(0.0, begin + seconds - _LAST - time.monotonic()))
         return footprint.growths(first, footprints(pids))
-    except OSError:  # one ended, which the caller reports
+    except OSError:  # a process has ended; the caller reports it
         return ()
 
 
@@ -213,7 +218,7 @@ def _evaluate(
 
 
 def isolated_environment() -> dict[str, str]:
-    """An environment with a DDS domain of its own, on this machine only."""
+    """Return an environment with a DDS domain of its own, restricted to this machine."""
     return (
         os.environ
         | thread_limits()
@@ -231,11 +236,12 @@ def isolated_environment() -> dict[str, str]:
 def cell(
     vademecum: Path, tip_radius: float = 0.005, priority: int = 0
 ) -> Iterator[tuple[dict[str, str], dict[str, Module]]]:
-    """Loader and contact node as processes; yields the environment to join them, and both.
+    """Run loader and contact node; yield the environment that joins them, and both processes.
 
     Raises
     ------
-    CellError : one of them failed, or did not end in time
+    CellError
+        If one of them failed, or did not end in time.
     """
     environment = isolated_environment()
     files = ["-p", f"library_dir:={vademecum.parent}", "-p", f"vademecum:={vademecum.name}"]
@@ -254,7 +260,7 @@ def cell(
 
 
 class Module(ModuleProcess):
-    """A node, or a module named with its room, as a process; its standard error is kept."""
+    """Process of a node, or of a module named with its room; its standard error is kept."""
 
     def __init__(self, name: str, arguments: list[str], environment: dict[str, str]) -> None:
         self._said = tempfile.TemporaryFile("w+")  # noqa: SIM115, closed with the object
@@ -270,25 +276,28 @@ class Module(ModuleProcess):
         )
 
     def said(self) -> str:
-        """All of standard error so far, without moving the file's position."""
+        """Return all of standard error so far, without moving the file's position."""
         number = self._said.fileno()
         return os.pread(number, os.fstat(number).st_size, 0).decode(errors="replace")
 
     def last_line(self) -> str:
-        """The last line of standard error."""
+        """Return the last line of standard error."""
         lines = [line.strip() for line in self.said().splitlines() if line.strip()]
         return lines[-1] if lines else f"no output, exit code {self.poll()}"
 
     def finish(self, seconds: float = _STOP_TIMEOUT, number: int = signal.SIGINT) -> int:
-        """End it as Ctrl-C would; returns its exit code."""
+        """End the process as Ctrl-C would; return its exit code."""
         return super().finish(seconds, number)
 
 
 def main() -> int:
+    """Measure a cell as the command line asks; return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m avatar_ros.bench.cell")
     parser.add_argument("vademecum", type=Path)
-    parser.add_argument("seconds", type=float, help="of each run [s]")
-    parser.add_argument("--changes", type=float, default=0.0, help="of the material [Hz]")
+    parser.add_argument("seconds", type=float, help="duration of each run [s]")
+    parser.add_argument(
+        "--changes", type=float, default=0.0, help="rate of changes of the material [Hz]"
+    )
     parser.add_argument("--output", type=Path, help="write all figures as JSON")
     chosen = parser.parse_args()
     return print_report(

@@ -24,11 +24,13 @@ from avatar_ros.msg import LoopStatistics
 
 
 def main() -> int:
+    """Take clouds and statistics until a signal comes; return the exit code."""
     output = Path(sys.argv[1])
     stop = StopSignal()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("cloud_viewer", enable_rosout=False, start_parameter_services=False)
-    clouds: Counter[int] = Counter()  # by second: a list of all would look like a leak
+    # counted by second: a list of all times would look like a leak
+    clouds: Counter[int] = Counter()
     n_bytes = [0]
     statistics: list[dict[str, Any]] = []
 

@@ -1,4 +1,4 @@
-"""What every ``python -m avatar_ros.bench`` does around its measurement."""
+"""Report and exit code that every ``python -m avatar_ros.bench`` shares."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ from avatar_core.errors import AvatarError
 
 @dataclass(frozen=True)
 class Report(ABC):
-    """Report of the benchmark of a name."""
+    """Base of the benchmarks' reports; ``name`` is that of the benchmark."""
 
     name: ClassVar[str]
 
     @property
     @abstractmethod
     def summary(self) -> dict[str, float]:
-        """Key figures."""
+        """Return the key figures."""
 
     @abstractmethod
     def table(self) -> str:
-        """In lines for a terminal."""
+        """Return the report as lines for a terminal."""
 
     def figures(self) -> dict[str, Any]:
-        """All of them."""
+        """Return all figures by name."""
         return asdict(self)
 
     def save(self, path: Path) -> None:
-        """Write all figures as JSON; those that could not be measured are null."""
+        """Write all figures as JSON; figures that could not be measured are null."""
         document = {"name": self.name, "summary": self.summary, **self.figures()}
         path.write_text(json.dumps(plain(document), indent=2, allow_nan=False) + "\n")
 
 
 def print_report(measure: Callable[[], Report], output: Path | None = None) -> int:
-    """Measure, save and print; returns the exit code."""
+    """Measure, save and print; return the exit code."""
     try:
         report = measure()
     except AvatarError as error:
         print(f"avatar: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        return 130  # by Ctrl-C, as shells count it
+        return 130  # exit code of shells after Ctrl-C
     if output:
         report.save(output)
     print(report.table(), flush=True)

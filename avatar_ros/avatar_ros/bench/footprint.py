@@ -7,16 +7,21 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-MAX_GROWTH = 5.0  # of a process in a run that is not a leak [MB]
+MAX_GROWTH = 5.0  # largest growth of a process in a run without a leak [MB]
 
 
 @dataclass(frozen=True)
 class Footprint:
     """Resources of one process at one moment.
 
-    memory_mb : that the system cannot reclaim: without code and pages of files
-    pss_mb : its share of all that it has in memory, code and pages of files too
-    files : open descriptors, sockets among them
+    Attributes
+    ----------
+    memory_mb : float
+        Memory that the system cannot reclaim: no code, no pages of files.
+    pss_mb : float
+        Proportional share of all its pages in memory, code and files included.
+    files : int
+        Open descriptors, including sockets.
     """
 
     memory_mb: float
@@ -26,7 +31,13 @@ class Footprint:
 
     @staticmethod
     def of(pid: int) -> Footprint:
-        """Raises OSError if there is no such process or it may not be inspected."""
+        """Read the footprint of a process.
+
+        Raises
+        ------
+        OSError
+            If there is no such process or it may not be inspected.
+        """
         lines = (line.split(":") for line in Path(f"/proc/{pid}/status").read_text().splitlines())
         status = {name: text.split() for name, text in lines}
         if "RssAnon" not in status:
@@ -48,11 +59,12 @@ class FootprintGrowth:
 
     @property
     def memory_mb(self) -> float:
+        """Growth of the memory that the system cannot reclaim [MB]."""
         return self.end.memory_mb - self.begin.memory_mb
 
     @property
     def complaint(self) -> str:
-        """What has grown, in words; empty if nothing has."""
+        """State what has grown, in words; empty if nothing has."""
         found = []
         if self.memory_mb >= MAX_GROWTH:
             found.append(f"{self.memory_mb:.1f} MB")
@@ -63,6 +75,7 @@ class FootprintGrowth:
         return f"{self.process} took {' and '.join(found)} more" if found else ""
 
     def row(self) -> str:
+        """Return a line of the table under ``HEADER``."""
         a, b = self.begin, self.end
         return (
             f"{self.process:34}{f'{a.memory_mb:.1f}':>10} {f'{self.memory_mb:+.1f}':>6}"
@@ -75,20 +88,21 @@ HEADER = f"{'process':34}{'MB':>10} {'growth':>6}{'PSS':>10}{'files':>10}{'threa
 
 
 def footprints(pids: dict[str, int]) -> dict[str, Footprint]:
-    """Footprints of processes, by name."""
+    """Read the footprints of processes, by name."""
     return {name: Footprint.of(pid) for name, pid in pids.items()}
 
 
 def growths(begin: dict[str, Footprint], end: dict[str, Footprint]) -> tuple[FootprintGrowth, ...]:
+    """Pair footprints from the begin and the end of a run."""
     return tuple(FootprintGrowth(name, begin[name], end[name]) for name in begin)
 
 
 def children(pid: int) -> Iterable[int]:
-    """Running processes that a process has started."""
+    """Yield the running processes that a process has started."""
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             parent = int(stat.read_text().rsplit(")", 1)[1].split()[1])
-        except OSError:  # it has just ended
+        except OSError:  # the process has just ended
             continue
         if parent == pid:
             yield int(stat.parent.name)

@@ -1,7 +1,7 @@
-"""What the nodes take of a processor while nobody asks anything of them.
+"""Processor time of the nodes while nobody asks anything of them.
 
-Contact node and loader run without a vademecum, the patients' service with an atlas if there is
-one, each in a domain of its own. ``avatar bench idle`` runs it as
+Contact node and loader run without a vademecum; the patients' service runs if an atlas is given.
+Each has a domain of its own. ``avatar bench idle`` runs it as
 ``python -m avatar_ros.bench.idle SECONDS``.
 """
 
@@ -20,18 +20,22 @@ from avatar_ros.bench.command import Report, print_report
 from avatar_ros.bench.footprint import children
 from avatar_ros.bench.thread_times import between, thread_times
 
-_LEAST = 0.0005  # of a core, of a thread that has a row of its own
-_CALM = 0.15  # of a core, below which a process has started, even if it gets but a fifth of one
-_SETTLED = 5  # seconds in a row below that
+_LEAST = 0.0005  # smallest fraction of a core for which a thread gets its own row
+_CALM = 0.15  # fraction of a core below which a start is over, even on a fifth of a core
+_SETTLED = 5  # seconds in a row below _CALM
 _START_TIMEOUT = 120.0  # [s]
 
 
 @dataclass(frozen=True)
 class IdleThread:
-    """One thread, or all of a process.
+    """Load of one thread, or of a whole process.
 
-    fraction : of a core
-    wake_ups : a second
+    Attributes
+    ----------
+    fraction : float
+        Fraction of a core.
+    wake_ups : float
+        Wake-ups per second.
     """
 
     process: str
@@ -40,6 +44,7 @@ class IdleThread:
     wake_ups: float
 
     def row(self) -> str:
+        """Return a line of the table under ``HEADER``."""
         return f"{self.process:32}{self.thread:18}{self.fraction:>9.2%}{self.wake_ups:>12.1f}"
 
 
@@ -49,7 +54,7 @@ ALL = "all"
 
 @dataclass(frozen=True)
 class IdleReport(Report):
-    """What ``avatar bench idle`` prints."""
+    """Report of ``avatar bench idle``."""
 
     name = "idle"
 
@@ -59,7 +64,7 @@ class IdleReport(Report):
 
     @property
     def summary(self) -> dict[str, float]:
-        """The fraction of a core of each node, its helpers included."""
+        """Return the fraction of a core of each node, its helper processes included."""
         found: dict[str, float] = {}
         for thread in self.threads:
             if thread.thread == ALL:
@@ -68,6 +73,7 @@ class IdleReport(Report):
         return found
 
     def table(self) -> str:
+        """Return one line for each thread, after the load average."""
         return "\n".join(
             [
                 f"load average {self.load_average:.2f} before; {self.seconds:g} s",
@@ -79,11 +85,12 @@ class IdleReport(Report):
 
 
 def run_idle(seconds: float, atlas: Path | None = None) -> IdleReport:
-    """Start the nodes, wait until they have nothing more to do, and measure.
+    """Start the nodes, wait until they are idle, and measure.
 
     Raises
     ------
-    CellError : one of them ended, or does not come to rest
+    CellError
+        If a node ended, or does not come to rest.
     """
     load = os.getloadavg()[0]
     with _nodes(atlas) as nodes:
@@ -117,7 +124,7 @@ def run_idle(seconds: float, atlas: Path | None = None) -> IdleReport:
 
 @contextmanager
 def _nodes(atlas: Path | None) -> Iterator[dict[str, Module]]:
-    """The nodes, none of which hears another."""
+    """Run the nodes, each isolated from the others."""
     of_patients = ["-p", "autostart:=false"]
     if atlas is not None:
         of_patients = ["-p", f"atlas:={atlas}", "-p", f"library_dir:={atlas.parent}"]
@@ -135,7 +142,7 @@ def _nodes(atlas: Path | None) -> Iterator[dict[str, Module]]:
 
 
 def _settle(nodes: dict[str, Module]) -> None:
-    """Wait until all nodes have been calm for some seconds."""
+    """Wait until all nodes have been idle for ``_SETTLED`` seconds."""
     end, calm, before = time.monotonic() + _START_TIMEOUT, 0, _used(nodes)
     while calm < _SETTLED:
         if time.monotonic() > end:
@@ -150,7 +157,7 @@ def _settle(nodes: dict[str, Module]) -> None:
 
 
 def _used(nodes: dict[str, Module]) -> dict[str, float]:
-    """Processor time of each node with its helpers so far [s]."""
+    """Return the processor time of each node with its helper processes so far [s]."""
     return {
         name: sum(
             thread.seconds
@@ -168,9 +175,10 @@ def _require_alive(nodes: dict[str, Module]) -> None:
 
 
 def main() -> int:
+    """Measure as the command line asks; return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m avatar_ros.bench.idle")
-    parser.add_argument("seconds", type=float, help="to measure [s]")
-    parser.add_argument("--atlas", type=Path, help="of the patients' service")
+    parser.add_argument("seconds", type=float, help="duration of the measurement [s]")
+    parser.add_argument("--atlas", type=Path, help="atlas for the patients' service")
     parser.add_argument("--output", type=Path, help="write all figures as JSON")
     chosen = parser.parse_args()
     return print_report(lambda: run_idle(chosen.seconds, chosen.atlas), chosen.output)

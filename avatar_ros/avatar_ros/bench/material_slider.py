@@ -1,8 +1,8 @@
-"""Changes the material while the tool moves, as a dragged slider of the planning page does.
+"""Changes of the material while the tool moves, as by dragging a slider of the planning page.
 
-Run as ``python -m avatar_ros.bench.material_slider FILE.h5 RATE COUNT.json``: sets Young's modulus
-and every coordinate that the vademecum has to random values, RATE times a second, until SIGINT or
-SIGTERM; then writes how many changes were accepted.
+Run as ``python -m avatar_ros.bench.material_slider FILE.h5 RATE COUNT.json``. It sets Young's
+modulus and every coordinate of the vademecum to random values, RATE times a second. At SIGINT or
+SIGTERM it writes how many changes were accepted.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ from avatar_ros.framework.managed_node import spin_until
 from avatar_ros.framework.stop_signal import StopSignal
 from avatar_ros.loop.settings import MATERIAL
 
-_YOUNG = (0.5, 2.0)  # times that of the vademecum
+_YOUNG = (0.5, 2.0)  # range relative to the vademecum's Young's modulus
 
 
 def main() -> int:
+    """Change the material until a signal comes; return the exit code."""
     vademecum, rate = load_vademecum(sys.argv[1]), float(sys.argv[2])
     ranges = _ranges(vademecum)
     rng = np.random.default_rng(0)
@@ -64,7 +65,7 @@ def main() -> int:
 
 
 def _ranges(vademecum: Vademecum) -> dict[str, tuple[float, float]]:
-    """By name of the contact node's parameter."""
+    """Return the range of each of the contact node's parameters, by name."""
     own = vademecum.material.young_modulus
     ranges = {"young": (_YOUNG[0] * own, _YOUNG[1] * own)}
     if vademecum.parametric is not None:

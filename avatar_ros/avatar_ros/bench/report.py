@@ -1,4 +1,4 @@
-"""The results of a measured cell, and how they are printed and written."""
+"""Results of a measured cell, and how they are printed and written."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from avatar_ros.bench.command import Report
 from avatar_ros.bench.footprint import FootprintGrowth
 from avatar_ros.bench.scripted_tool import RoundTrips
 
-PROMISED_ON_TIME = 0.99  # of the contact loop's periods, on a quiet machine
+PROMISED_ON_TIME = 0.99  # fraction of the contact loop's periods, on a quiet machine
 
 
 @dataclass(frozen=True)
 class Times:
-    """Of periods or latencies [ms]."""
+    """Median, 99th percentile and maximum of periods or latencies [ms]."""
 
     p50_ms: float
     p99_ms: float
@@ -25,6 +25,7 @@ class Times:
 
     @staticmethod
     def of(seconds: np.ndarray) -> Times:
+        """Summarise times given in seconds; NaN if there are none."""
         if len(seconds) == 0:
             return Times(np.nan, np.nan, np.nan)
         return Times(*(float(x) for x in 1e3 * np.percentile(seconds, (50, 99, 100))))
@@ -32,22 +33,38 @@ class Times:
 
 @dataclass(frozen=True)
 class CellMeasurement:
-    """One run of the cell.
+    """Figures of one run of the cell.
 
-    priority : SCHED_FIFO priority that the tool was granted, 0 without
-    load_average : of the last minute, before the run; processes of others disturb
-    rate_hz, on_time_fraction : periods of the contact loop, by its own clock; on time: <= 1.5 ms
-    rate_at_tool_hz, on_time_at_tool_fraction : periods between wrenches that reached the tool
-    latency : from publishing a pose to its wrench in hand, in the tool
-    answered_fraction : poses that got a wrench of their own
-    compute_p99_ms : worst second of the contact node, from pose in hand to wrench published
-    floor : periods of the sleeping loop in the same seconds
-    bare_work_on_time_fraction : of a loop that computes as long as the contact node, alone
-    cloud_hz, cloud_bytes : what the viewer got
-    material_changes : that the contact node accepted in the run
-    force_max_n : largest force on the tool
-    growths : of every process of the cell
-    round_trips : every pose and its answer; not in the data file
+    Attributes
+    ----------
+    priority : int
+        SCHED_FIFO priority that the tool was granted, 0 without.
+    load_average : float
+        Load average of the last minute before the run; other processes disturb it.
+    rate_hz, on_time_fraction : float
+        Periods of the contact loop by its own clock; on time: at most 1.5 ms.
+    rate_at_tool_hz, on_time_at_tool_fraction : float
+        Periods between wrenches that reached the tool.
+    latency : Times
+        Time from publishing a pose to having its wrench, measured in the tool.
+    answered_fraction : float
+        Fraction of poses that got their own wrench.
+    compute_p99_ms : float
+        99th percentile from having a pose to publishing its wrench, in the worst second.
+    floor : Times
+        Periods of the sleeping loop in the same seconds.
+    bare_work_on_time_fraction : float
+        The same for a loop that computes as long as the contact node, alone.
+    cloud_hz, cloud_bytes : float, int
+        Rate and size of the clouds that the viewer got.
+    material_changes : int
+        Changes that the contact node accepted in the run.
+    force_max_n : float
+        Largest force on the tool.
+    growths : tuple of FootprintGrowth
+        Growth of every process of the cell.
+    round_trips : RoundTrips
+        Every pose and its answer; not in the data file.
     """
 
     priority: int
@@ -73,7 +90,7 @@ class CellMeasurement:
 
     @property
     def complaints(self) -> list[str]:
-        """What must not happen in a run of any length on a quiet machine, one line each."""
+        """List violations of what a run on a quiet machine must keep, one line each."""
         late = f"{1.0 - self.on_time_fraction:.2%} of the periods were late"
         found = [late] if self.on_time_fraction < PROMISED_ON_TIME else []
         return found + [growth.complaint for growth in self.growths if growth.complaint]
@@ -81,7 +98,7 @@ class CellMeasurement:
 
 @dataclass(frozen=True)
 class CellReport(Report):
-    """What ``avatar bench cell`` prints; ``real_time`` is None where priority is refused."""
+    """Report of ``avatar bench cell``; ``real_time`` is None where priority is refused."""
 
     name = "cell"
 
@@ -93,7 +110,7 @@ class CellReport(Report):
 
     @property
     def summary(self) -> dict[str, float]:
-        """The figures of the better mode that was run, under the names of the data file."""
+        """Return the figures of the better mode that was run, under the names of the data file."""
         best = self.real_time or self.ordinary
         if best is None:
             return {}
@@ -105,7 +122,7 @@ class CellReport(Report):
         }
 
     def figures(self) -> dict[str, Any]:
-        """All but the round trips."""
+        """Return all figures except the round trips."""
         found = super().figures()
         for run in (found["real_time"], found["ordinary"]):
             if run is not None:
@@ -113,7 +130,7 @@ class CellReport(Report):
         return found
 
     def table(self) -> str:
-        """Both modes side by side, one figure a line; then what the processes took."""
+        """Return both modes side by side, one figure a line, then the growth of the processes."""
         runs = [run for run in (self.real_time, self.ordinary) if run is not None]
         names = [f"SCHED_FIFO {run.priority}" if run.priority else "ordinary" for run in runs]
         lines = [f"{'':34}" + "".join(f"{name:>16}" for name in names)]

@@ -1,4 +1,4 @@
-"""A tool that palpates by itself: approaches the organ, pushes, slides, and times the answers.
+"""A tool that palpates on its own: approaches the organ, pushes, slides, and times the answers.
 
 Run as ``python -m avatar_ros.bench.scripted_tool FILE.h5``; poses and answers go into an ``.npz``
 file.
@@ -28,24 +28,32 @@ from avatar_ros.framework.templates import PoseTemplate, WrenchReader, stamp_byt
 from avatar_ros.msg import ContactState
 
 READY = "palpating"  # printed when the measured part begins
-_CLEARANCE = 0.020  # above the surface before and after a touch [m]
+_CLEARANCE = 0.020  # height over the surface before and after a touch [m]
 _SLIDE = 0.040  # [m]
 _SLIDE_DEPTH = 0.003  # [m]
-_PUSHES = 2  # a touch
-_TOUCH = 4.0  # approach, push, slide, leave [s]
-_HEADINGS = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))  # of the slides, in turn
-_WAKE_MARGIN = 150_000  # before a tick the tool stops listening [ns]
-_SETTLE = 1.0  # poses sent before the measured part [s]
+_PUSHES = 2  # pushes in a touch
+_TOUCH = 4.0  # duration of a touch: approach, push, slide, leave [s]
+_HEADINGS = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))  # directions of the slides, in turn
+_WAKE_MARGIN = 150_000  # time before a tick at which the tool stops listening [ns]
+_SETTLE = 1.0  # time of poses sent before the measured part [s]
 
 
 @dataclass(frozen=True)
 class RoundTrips:
     """The poses that a tool sent and the answers, one entry per pose.
 
-    tips : (n, 3) [m]; forces : (n, 3) [N], NaN where no answer came
-    latencies : (n,), from publishing the pose to its wrench in hand [s]; NaN without answer
-    arrivals : (m,), of every wrench, on the monotonic clock [s]
-    begin, end : of the measured part, on the monotonic clock [s]
+    Attributes
+    ----------
+    tips : ndarray, shape (n, 3)
+        Positions of the tip [m].
+    forces : ndarray, shape (n, 3)
+        Forces [N], NaN without an answer.
+    latencies : ndarray, shape (n,)
+        Time from publishing a pose to having its wrench [s], NaN without an answer.
+    arrivals : ndarray, shape (m,)
+        Arrival of every wrench on the monotonic clock [s].
+    begin, end : float
+        Limits of the measured part on the monotonic clock [s].
     """
 
     tips: np.ndarray
@@ -57,10 +65,12 @@ class RoundTrips:
     priority: int
 
     def save(self, path: Path) -> None:
+        """Write all arrays to an ``.npz`` file."""
         np.savez(path, **vars(self))
 
     @staticmethod
     def load(path: Path) -> RoundTrips:
+        """Read the arrays that :meth:`save` wrote."""
         with np.load(path) as held:
             values: dict[str, Any] = {name: held[name] for name in held.files}
         return RoundTrips(**values)
@@ -72,10 +82,12 @@ class RoundTrips:
 def palpation(
     vademecum: Vademecum, tip_radius: float, seconds: float, rate: float, depth: float = 0.005
 ) -> np.ndarray:
-    """Centres of a sphere, shape (seconds * rate, 3) [m]: touches of four seconds, over and over.
+    """Return centres of a sphere, shape (seconds * rate, 3) [m]: touches of four seconds in a row.
 
-    Along the surface normal to the organ, two sinusoidal pushes of ``depth`` [m], a slide of
-    40 mm there and back at 3 mm depth, and away. Odd touches slide at right angles to even ones.
+    A touch moves along the surface normal to the organ and pushes twice by ``depth`` [m], as a
+    sine.
+    Then it slides 40 mm there and back at 3 mm depth, and leaves. Odd touches slide at right angles
+    to even ones.
     """
     path = np.concatenate([_touch(vademecum, tip_radius, rate, depth, way) for way in _HEADINGS])
     return np.resize(path, (round(seconds * rate), 3))
@@ -88,7 +100,7 @@ def _touch(
     depth: float,
     heading: tuple[float, float, float],
 ) -> np.ndarray:
-    """One touch, shape (_TOUCH * rate, 3) [m]."""
+    """Return one touch, shape (_TOUCH * rate, 3) [m]."""
     phase = (np.arange(round(_TOUCH * rate)) + 0.5) / round(_TOUCH * rate)
     approach, push, slide, leave = (
         np.clip((phase - start) / length, 0.0, 1.0)
@@ -112,7 +124,7 @@ def _ease(x: np.ndarray) -> np.ndarray:
 
 
 class ScriptedTool:
-    """Publishes ``NAME/measured_cp`` on time and listens to ``NAME/servo_cf`` between."""
+    """Tool that publishes ``NAME/measured_cp`` on time and listens to ``NAME/servo_cf`` between."""
 
     def __init__(self, node: Node, name: str, frame_id: str, rate: float) -> None:
         self._node = node
@@ -127,11 +139,12 @@ class ScriptedTool:
         self._wait_set = _rclpy.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
 
     def wait_for_model(self, timeout: float) -> None:
-        """Until the contact node answers with a vademecum.
+        """Wait until the contact node answers with a vademecum.
 
         Raises
         ------
         TimeoutError
+            If no contact node has one in time.
         """
         loaded: list[str] = []
 
@@ -148,11 +161,11 @@ class ScriptedTool:
         self._node.destroy_subscription(listener)
 
     def play(self, tips: np.ndarray, stop: StopSignal, priority: int = 0) -> RoundTrips:
-        """Send one pose a period; returns what came back."""
+        """Send one pose per period; return the poses with their answers."""
         n = len(tips)
         forces = np.full((n, 3), np.nan)
         latencies = np.full(n, np.nan)
-        sent = np.full(n, 0)  # in memory now, not page by page
+        sent = np.full(n, 0)  # allocated now, not page by page in the loop
         arrivals = np.full(4 * n + 64, 0)
         n_arrivals = 0
         offset = time.time_ns() - time.monotonic_ns()
@@ -189,7 +202,7 @@ class ScriptedTool:
         )
 
     def _listen(self, until: int) -> bytes | None:
-        """The next wrench, serialised, or None if none came in time."""
+        """Return the next wrench, serialised, or None if none came in time."""
         handle = self._subscription.handle
         wait_set = self._wait_set
         while (left := until - time.monotonic_ns()) > 0:
@@ -203,8 +216,10 @@ class ScriptedTool:
 
 
 def main() -> int:
+    """Palpate as the command line asks; return the exit code."""
     options = _options()
-    vademecum = load_vademecum(options.vademecum)  # a broken one ends before anything runs
+    # a damaged file ends the process before anything runs
+    vademecum = load_vademecum(options.vademecum)
     tips = palpation(vademecum, options.tip_radius, options.seconds, options.rate)
     del vademecum
     stop = StopSignal()
@@ -232,12 +247,16 @@ def _options() -> argparse.Namespace:
     parser.add_argument("vademecum", type=Path, help="file with the organ's surface")
     parser.add_argument("--tool", default="tool", help="name of the tool")
     parser.add_argument("--frame", default="organ", help="frame of its poses")
-    parser.add_argument("--tip-radius", type=float, default=0.005, help="of a sphere [m]")
+    parser.add_argument(
+        "--tip-radius", type=float, default=0.005, help="radius of the spherical tip [m]"
+    )
     parser.add_argument("--seconds", type=float, default=60.0, help="duration [s]")
     parser.add_argument("--rate", type=float, default=1000.0, help="poses per second [Hz]")
     parser.add_argument("--priority", type=int, default=0, help="SCHED_FIFO priority; 0: none")
     parser.add_argument("--cpu", type=int, default=-1, help="core; -1: any")
-    parser.add_argument("--timeout", type=float, default=60.0, help="for the contact node [s]")
+    parser.add_argument(
+        "--timeout", type=float, default=60.0, help="time to wait for the contact node [s]"
+    )
     parser.add_argument("--output", type=Path, help="file for poses and answers (.npz)")
     return parser.parse_args()
 

@@ -1,4 +1,4 @@
-"""From launch to the first force: when each stage is reached, and what it takes of a processor.
+"""Time and processor time of each stage from launch to the first force.
 
 A cell is started as ``avatar cell`` does it, or by ``ros2 launch``, while a tool already holds its
 tip in the organ. ``avatar bench start`` runs it as ``python -m avatar_ros.bench.start VADEMECUM``.
@@ -34,9 +34,9 @@ from avatar_ros.framework.templates import PoseTemplate, stamp_bytes
 from avatar_ros.msg import ContactState, VademecumInfo
 
 STAGES = ("contact node answers", "vademecum announced", "first wrench with a model", "first force")
-_RADIUS = 5e-3  # of the tip, the node's default [m]
+_RADIUS = 5e-3  # radius of the tip, the node's default [m]
 _DEPTH = 3e-3  # [m]
-_PERIOD = 10e-3  # of the poses, below three quarters of the default pose_timeout [s]
+_PERIOD = 10e-3  # period of the poses, below three quarters of the default pose_timeout [s]
 _TIMEOUT = 120.0  # [s]
 _STOP_TIMEOUT = 20.0  # [s]
 _NAMES = {
@@ -50,8 +50,12 @@ _NAMES = {
 class StartStage:
     """One stage of a start.
 
-    seconds : since the launch [s]
-    cpu : processor time of each process until then [s]
+    Attributes
+    ----------
+    seconds : float
+        Time since the launch [s].
+    cpu : dict
+        Processor time of each process until then [s].
     """
 
     name: str
@@ -61,7 +65,7 @@ class StartStage:
 
 @dataclass(frozen=True)
 class StartReport(Report):
-    """What ``avatar bench start`` prints."""
+    """Report of ``avatar bench start``."""
 
     name = "start"
 
@@ -71,11 +75,12 @@ class StartReport(Report):
 
     @property
     def summary(self) -> dict[str, float]:
+        """Return time and processor time of all processes until the last stage."""
         last = self.stages[-1]
         return {"seconds": last.seconds, "cpu_seconds": sum(last.cpu.values())}
 
     def table(self) -> str:
-        """One stage a line; columns: when, processor time of all, and of each process."""
+        """Return one stage a line: time, processor time of all, and of each process."""
         names = list(self.stages[-1].cpu)
         width = max(len(name) for name in names) + 2
         lines = [
@@ -92,11 +97,17 @@ class StartReport(Report):
 def run_start(vademecum: Path, command: list[str] | None = None) -> StartReport:
     """Start a cell with a vademecum and wait for the first force on a tool.
 
-    command : that starts a cell; None: that of ``avatar cell``
+    Parameters
+    ----------
+    vademecum : Path
+        Vademecum file.
+    command : sequence of str, optional
+        Command that starts a cell; by default that of ``avatar cell``.
 
     Raises
     ------
-    CellError : the cell ended, or gave no force in time
+    CellError
+        If the cell ended, or gave no force in time.
     """
     vademecum = vademecum.resolve()
     tip = _tip(vademecum)
@@ -131,7 +142,7 @@ def run_start(vademecum: Path, command: list[str] | None = None) -> StartReport:
 
 
 def _tip(vademecum: Path) -> Any:
-    """Centre of a tip that presses on the middle of the accessible surface, shape (3,) [m]."""
+    """Return the centre of a tip that presses the middle of the accessible surface, (3,) [m]."""
     organ = load_vademecum(vademecum)
     middle = tool_path.middle_of_access(organ)
     surface = organ.surface
@@ -139,7 +150,7 @@ def _tip(vademecum: Path) -> Any:
 
 
 class _Watcher:
-    """A tool that holds still, and notes when the cell reaches each stage."""
+    """Tool that holds still, and notes when the cell reaches each stage."""
 
     def __init__(self, context: Any, tip: Any) -> None:
         self._node = rclpy.create_node("start_watcher", context=context, enable_rosout=False)
@@ -157,7 +168,7 @@ class _Watcher:
         node.create_timer(_PERIOD, self._send)
 
     def watch(self, process: subprocess.Popen[bytes], begin: float) -> list[StartStage]:
-        """Serve until the last stage is reached; the stages in the order in which they were."""
+        """Serve until the last stage is reached; return the stages in the order of arrival."""
         stages: list[StartStage] = []
 
         def note(name: str) -> None:
@@ -201,12 +212,12 @@ class _Watcher:
 
 
 def _cpu(pid: int) -> dict[str, float]:
-    """Processor time of a process and all below it, by name [s]."""
+    """Return the processor time of a process and its descendants, by name [s]."""
     found = {}
     waiting = [(pid, "")]
     while waiting:
         number, parent = waiting.pop(0)
-        with suppress(OSError):  # it ended meanwhile
+        with suppress(OSError):  # the process has ended
             name = _name(number, parent)
             found[name] = sum(thread.seconds for thread in thread_times(number).values())
             waiting += [(child, name) for child in sorted(children(number))]
@@ -221,10 +232,13 @@ def _name(pid: int, parent: str) -> str:
 
 
 def main() -> int:
+    """Measure as the command line asks; return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m avatar_ros.bench.start")
     parser.add_argument("vademecum", type=Path)
     parser.add_argument("--output", type=Path, help="write all figures as JSON")
-    parser.add_argument("command", nargs="*", help="that starts the cell; default: avatar cell")
+    parser.add_argument(
+        "command", nargs="*", help="command that starts the cell; default: avatar cell"
+    )
     chosen = parser.parse_args()
     return print_report(lambda: run_start(chosen.vademecum, chosen.command or None), chosen.output)
 

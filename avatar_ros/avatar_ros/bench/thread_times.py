@@ -9,10 +9,14 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class ThreadTime:
-    """What one thread has taken so far.
+    """Load of one thread so far.
 
-    seconds : of a processor [s]
-    wake_ups : how often it went to sleep of itself, and woke up
+    Attributes
+    ----------
+    seconds : float
+        Processor time [s].
+    wake_ups : int
+        Number of times it went to sleep voluntarily and woke up.
     """
 
     name: str
@@ -21,10 +25,10 @@ class ThreadTime:
 
 
 def thread_times(pid: int) -> dict[int, ThreadTime]:
-    """Of all threads of a process, by number; that of the main thread is ``pid``."""
+    """Read the times of all threads of a process, by number; ``pid`` is the main thread."""
     found = {}
     for task in Path(f"/proc/{pid}/task").iterdir():
-        with suppress(OSError):  # it ended meanwhile
+        with suppress(OSError):  # the thread has ended
             name = (task / "comm").read_text().strip()
             nanoseconds = int((task / "schedstat").read_text().split()[0])
             status = (task / "status").read_text()
@@ -34,7 +38,7 @@ def thread_times(pid: int) -> dict[int, ThreadTime]:
 
 
 def between(begin: dict[int, ThreadTime], end: dict[int, ThreadTime]) -> dict[int, ThreadTime]:
-    """What each thread took from one moment to another, the most first."""
+    """Return the load of each thread between two moments, the largest first."""
     nothing = ThreadTime("", 0.0, 0)
     taken = {}
     for number, now in end.items():

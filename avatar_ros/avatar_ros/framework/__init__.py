@@ -1,3 +1,5 @@
-"""What the nodes have in common: managed life cycle, declared parameters, quality of service,
-message templates and conversions, real-time priority, saved state, and confined reading of files.
+"""Functions that all nodes share.
+
+Managed life cycle, declared parameters, quality of service, message templates and conversions,
+real-time priority, saved state, and confined reading of files.
 """

@@ -1,4 +1,4 @@
-"""Subscriptions to what one node of a cell announces: the vademecum and what is said of it."""
+"""Subscriptions to the announcements of one node of a cell, such as the vademecum."""
 
 from __future__ import annotations
 
@@ -13,13 +13,18 @@ from avatar_ros.framework.ports import ONE_CELL, rivals
 
 
 class Announced:
-    """Takes announcements of one node; while several nodes publish the topic, it takes none.
+    """Subscription to one node's announcements; it takes none while several nodes publish.
 
-    A message does not tell its publisher, so another cell's cannot be told from this one's. Once
-    one publisher is left, what it announced last is taken.
+    A message does not name its publisher, so another cell's message looks like this one's. Once one
+    publisher is left, its last announcement is taken.
 
-    take : called with each message that is taken
-    refuse : called with each that is not, and the reason in one line; without it, that is logged
+    Parameters
+    ----------
+    take : callable
+        Called with each message that is taken.
+    refuse : callable, optional
+        Called with each refused message and the reason in one line; by default the reason is
+        logged.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Services that answer whatever they are asked, and topics that take whatever is sent."""
+"""Services that answer any request, and topics that survive any message."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ from rclpy.node import Node
 from avatar_core.errors import one_line
 from avatar_ros.framework.parameters import ParameterError
 
-Answer = Callable[[Any, Any], Any]  # of a request and an empty response
+Answer = Callable[[Any, Any], Any]  # takes a request and an empty response
 
 
 def answer_always(node: Node) -> None:
-    """Have each service of a node refuse, and log, a request that its callback raises for.
+    """Make each service of a node refuse, and log, requests for which its callback raises.
 
     rclpy's own services raise, e.g. for a transition that is not allowed now. The exception would
     end the node, and its client would wait forever.
     """
     for service in node.services:
-        if not iscoroutinefunction(service.callback):  # those are ours, and catch all
+        # our own services, which catch all exceptions
+        if not iscoroutinefunction(service.callback):
             service.callback = _answering(node, service)
 
 
 def never_raising(node: Node, topic: str, callback: Callable[..., Any]) -> Callable[..., None]:
-    """A callback of a topic that logs what ``callback`` raises."""
+    """Wrap the callback of a topic so that its exceptions are logged."""
 
-    @wraps(callback)  # rclpy looks at its parameters
+    @wraps(callback)  # keeps the signature, which rclpy inspects
     def hear(*message: Any) -> None:
         try:
             callback(*message)
@@ -65,7 +66,7 @@ def _require_declared(node: Node, kind: Any, request: Any) -> None:
 
 
 def _one_by_one(answer: Answer) -> Answer:
-    """Set each parameter by itself, so that one that is refused keeps no other from being set."""
+    """Set each parameter separately, so that a refused value does not block the others."""
 
     def answer_each(request: SetParameters.Request, response: SetParameters.Response) -> Any:
         for parameter in request.parameters:
@@ -77,8 +78,8 @@ def _one_by_one(answer: Answer) -> Answer:
 
 
 def _refused(kind: Any, request: Any, reason: str) -> Any:
-    """A response that says so where it has a field for it, otherwise an empty one."""
-    response = kind.Response()  # ``success`` is false in it
+    """Return a response with the reason where the type has a field for it, else an empty one."""
+    response = kind.Response()  # its ``success`` is false
     result = SetParametersResult(successful=False, reason=reason)
     if kind is SetParameters:
         response.results = [result for _ in request.parameters]

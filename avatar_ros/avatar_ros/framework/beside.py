@@ -1,4 +1,4 @@
-"""Long work for an answer, in a thread of its own."""
+"""Long work for an answer, in a separate thread."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ T = TypeVar("T")
 class Beside:
     """Work in separate threads, awaited while the node's executor keeps running.
 
-    n_awaited : answers that are still to be sent
+    Attributes
+    ----------
+    n_awaited : int
+        Number of answers still to be sent.
     """
 
     def __init__(self, node: Node, name: str) -> None:
@@ -23,9 +26,9 @@ class Beside:
         self._node, self._name = node, name
 
     async def done(self, work: Callable[[], T]) -> T:
-        """What ``work`` returns or raises, awaited by a callback of the node."""
+        """Await the result of ``work`` in a callback of the node; exceptions are passed on."""
         executor = self._node.executor
-        assert executor is not None  # which runs this
+        assert executor is not None  # the executor runs this callback
         result: Any = Future(executor=executor)
 
         def run() -> None:

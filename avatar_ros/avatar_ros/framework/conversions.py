@@ -1,6 +1,6 @@
 """Conversions between the core's arrays and ROS messages, outside the loop.
 
-Those of the loop are in :mod:`avatar_ros.framework.templates`.
+Conversions in the loop are in :mod:`avatar_ros.framework.templates`.
 """
 
 from __future__ import annotations
@@ -17,18 +17,20 @@ from avatar_ros.msg import VademecumFile, VademecumInfo
 
 
 def vademecum_info(info: dict[str, Any], header: Header) -> VademecumInfo:
-    """The message of an ``avatar_core.vademecum.model.VademecumInfo``, given by its fields."""
+    """Convert the fields of an ``avatar_core.vademecum.model.VademecumInfo`` to its message."""
     return VademecumInfo(header=header, **info)
 
 
 def vademecum_file(identity: str, name: str, data: bytes) -> VademecumFile:
+    """Return the message with the content of a vademecum file."""
     message = VademecumFile(id=identity, name=name)
-    message.data = array.array("B", data)  # assigning bytes would check each one: 100 times slower
+    # assigning bytes would check each of them: 100 times slower
+    message.data = array.array("B", data)
     return message
 
 
 def surface_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    """Triangles in the organ frame; ``vertices`` (n, 3) [m], ``faces`` (m, 3)."""
+    """Return triangles in the organ frame; ``vertices`` (n, 3) [m], ``faces`` (m, 3)."""
     return Mesh(
         vertices=[Point(x=x, y=y, z=z) for x, y, z in vertices.astype(np.float64).tolist()],
         triangles=[
@@ -38,9 +40,9 @@ def surface_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
 
 
 def mesh_arrays(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) and faces (m, 3) of a message, whatever they hold."""
+    """Return vertices (n, 3) and faces (m, 3) of a message, without checking the values."""
     n, m = len(mesh.vertices), len(mesh.triangles)
     numbers = (x for p in mesh.vertices for x in (p.x, p.y, p.z))
     corners = (corner for triangle in mesh.triangles for corner in triangle.vertex_indices)
-    vertices = np.fromiter(numbers, np.float64, 3 * n)  # lists of them would take ten times more
+    vertices = np.fromiter(numbers, np.float64, 3 * n)  # lists would take ten times the memory
     return vertices.reshape(n, 3), np.fromiter(corners, np.int64, 3 * m).reshape(m, 3)

@@ -1,13 +1,13 @@
-"""Who can reach a node, and over which transport: this machine only, unless the user opens it.
+"""Reach of a node and its transport: this machine only, unless the user opens it.
 
-Nothing in this project authenticates anybody. To let other machines take part, export
+Nothing in this project authenticates peers. To let other machines take part, export
 ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET; see msg_docs/guides/security.md.
 
 A node that must keep time does not use shared memory. With shared memory, Fast DDS checks whether
-the port of a joining process is alive (``Port::healthy_check``), sometimes sleeps for a third of a
-second until it is, and meanwhile holds a lock that all publishers need: the contact loop stood
-still in 3 of 40 starts of another node. Over the loopback, a wrench arrives as fast. The other
-nodes keep shared memory, for vademecums of 50 MB.
+the port of a joining process is alive (``Port::healthy_check``). It sometimes sleeps for a third of
+a second until the port is, and meanwhile holds a lock that all publishers need. The contact loop
+stood still in 3 of 40 starts of another node. Over the loopback, a wrench arrives as fast. The
+other nodes keep shared memory, for vademecums of 50 MB.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from avatar_core.errors import AvatarError
 
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 LOCAL = "LOCALHOST"
-BY_PROFILE = "SYSTEM_DEFAULT"  # the range is what the profile says; LOCALHOST adds shared memory
-PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"  # as Fast DDS 2 reads it
-_OTHER_PROFILES = "FASTDDS_DEFAULT_PROFILES_FILE"  # from Fast DDS 3 on
-TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"  # where no profile names them
+BY_PROFILE = "SYSTEM_DEFAULT"  # the profile sets the range; LOCALHOST would add shared memory
+PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"  # the variable that Fast DDS 2 reads
+_OTHER_PROFILES = "FASTDDS_DEFAULT_PROFILES_FILE"  # the variable from Fast DDS 3 on
+TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"  # the variable that counts without a profile
 _PEERS = "ROS_STATIC_PEERS"
-_FAST_DDS = "rmw_fastrtps"  # of several kinds; another reads neither profile nor transports
+# prefix of its identifiers; other middleware reads neither profile nor transports
+_FAST_DDS = "rmw_fastrtps"
 _PARAMS = Path("share", "avatar_ros", "params")  # below a prefix
 _LOCAL_PROFILE = "this_machine_only.xml"
 _UDP_PROFILE = "this_machine_udp.xml"
@@ -39,9 +40,9 @@ class DiscoveryError(AvatarError):
 def stay_local(environment: MutableMapping[str, str] = os.environ) -> None:
     """Restrict this process and those that it starts to this machine; before ``rclpy.init()``.
 
-    The range keeps nodes from looking for others, the profile from hearing them: with the range
-    alone, a node answers anybody who knows its address. A range, peers or a profile that the user
-    has set stay as they are.
+    The range keeps nodes from looking for others; the profile keeps others from reaching them. With
+    the range alone, a node answers anybody who knows its address. A range, peers or a profile that
+    the user has set stay as they are.
 
     Raises
     ------
@@ -58,12 +59,17 @@ def stay_local(environment: MutableMapping[str, str] = os.environ) -> None:
 def udp_alone(
     middleware: str, environment: MutableMapping[str, str] = os.environ
 ) -> Iterator[None]:
-    """Use UDP alone while a time-critical node is made, but not in processes started later.
+    """Use only UDP while a time-critical node is made, but not in processes started later.
 
     Call ``stay_local`` first. A profile or transports that the user has set stay as they are.
-    Middleware other than Fast DDS is left alone: it obeys nothing but the range LOCALHOST.
+    Middleware other than Fast DDS is left alone: it reads nothing but the range LOCALHOST.
 
-    middleware : identifier of the one in use, as ``rmw_fastrtps_cpp``
+    Parameters
+    ----------
+    middleware : str
+        Identifier of the middleware in use, e.g. ``rmw_fastrtps_cpp``.
+    environment : mapping, optional
+        Environment variables; by default those of this process.
 
     Raises
     ------

@@ -1,9 +1,9 @@
-"""The end of a process whose middleware does not let it end.
+"""Forced end of a process whose middleware does not let it end.
 
 Fast DDS 2 waits for its callbacks before it removes a participant. Built with GCC 9 or before, as
-the wheels are, it waits forever, spinning, if a callback is under way just then, such as that
-another process joins (Fast DDS, issue 6513). It waits with the interpreter's lock: no Python could
-end the process.
+in the wheels, it can wait forever. That happens if a callback is running just then, e.g. because
+another process joins (Fast DDS, issue 6513). It spins with the interpreter's lock held, so no
+Python code could end the process.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class _Timer(ctypes.Structure):
 
 
 def end_within(seconds: float, code: int) -> None:
-    """End this process with an exit code in so many seconds if it has not ended by then.
+    """End this process with an exit code after some seconds, unless it has ended by then.
 
-    What it has said is flushed now; nothing is cleaned up then. The C library does it alone.
+    Output is flushed now; nothing is cleaned up at the end. The timer is the C library's.
     """
     for stream in (sys.stdout, sys.stderr):
         stream.flush()

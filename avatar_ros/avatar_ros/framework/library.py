@@ -1,8 +1,8 @@
 """The only directory that names from the network can reach.
 
-A name in a request is a path inside ``library_dir`` and has to lead to a regular file there, also
-through links. The file is checked again after it was opened, so that changing the library in
-between cannot lead outside.
+A name in a request is a path inside ``library_dir`` and must lead to a regular file there, also
+through links. The file is checked again after opening, so that a change of the library in between
+cannot lead outside.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from typing import BinaryIO
 from avatar_core.common.files import FileError, content_of, opened
 from avatar_core.errors import AvatarError
 
-LONGEST_NAME = 200  # of a file, leaving room for the suffix of a temporary file [bytes]
-LONGEST_PATH = 1000  # [letters]
+LONGEST_NAME = 200  # longest file name, with room for the suffix of a temporary file [bytes]
+LONGEST_PATH = 1000  # longest path [characters]
 
 
 class RefusedError(AvatarError):
@@ -25,18 +25,19 @@ class RefusedError(AvatarError):
 
 
 def find_in_library(name: str, library_dir: str, max_bytes: int) -> Path:
-    """The file ``name`` of the library, to be opened by its path.
+    """Return the path of the file ``name`` in the library, to be opened.
 
     Raises
     ------
-    RefusedError : it lies outside, is no regular file, is missing or too large
+    RefusedError
+        If it lies outside, is no regular file, is missing or too large.
     """
     with _opened(name, library_dir, max_bytes) as (_, path):
         return path
 
 
 def read_in_library(name: str, library_dir: str, max_bytes: int) -> bytes:
-    """The content of the file ``name`` of the library; RefusedError as :func:`find_in_library`."""
+    """Return the content of the file ``name``; RefusedError as :func:`find_in_library`."""
     with _opened(name, library_dir, max_bytes) as (source, _):
         try:
             return content_of(source)
@@ -45,9 +46,12 @@ def read_in_library(name: str, library_dir: str, max_bytes: int) -> bytes:
 
 
 def file_name(name: str) -> str:
-    """A file in library_dir itself, ending in .h5.
+    """Check the name of a file in library_dir itself; return it with the suffix .h5.
 
-    Raises RefusedError for a path, a hidden or an overlong name.
+    Raises
+    ------
+    RefusedError
+        For a path, a hidden or an overlong name.
     """
     if "/" in name or name.startswith(".") or not name.isprintable():
         raise RefusedError(

@@ -1,4 +1,4 @@
-"""What all nodes have in common: managed transitions, start, signals, exit code."""
+"""Life cycle that all nodes share: managed transitions, start, signals, exit code."""
 
 from __future__ import annotations
 
@@ -27,21 +27,26 @@ from avatar_ros.framework.parameters import Parameter, ParameterError, declare
 from avatar_ros.framework.ports import Ports
 from avatar_ros.framework.stop_signal import Stopped, StopSignal
 
-_END = 1.0  # from the last answer to the end of the process [s]
-_LAST_ANSWERS = 1.0  # for requests that are pending when the node ends [s]
-_LOOK = 0.1  # at whether they are answered [s]
+_END = 1.0  # limit from the last answer to the end of the process [s]
+_LAST_ANSWERS = 1.0  # limit for requests that are pending when the node ends [s]
+_LOOK = 0.1  # period of checks whether pending requests are answered [s]
 
 
 class ManagedNode(LifecycleNode, ABC):
-    """A lifecycle node whose transitions may raise; the error is the reason of the refusal.
+    """Lifecycle node whose transitions may raise; the error is the reason of the refusal.
 
     A subclass implements ``configure``, ``activate``, ``deactivate`` and ``clean_up``; the last two
     may be called in any state. Parameters are declared here, so that a wrong value is refused
     before anything starts.
 
-    refusal : why the last transition failed
-    is_shut_down : whether it was shut down, by the process or by a client
-    ports : makes publishers and subscriptions
+    Attributes
+    ----------
+    refusal : str
+        Reason why the last transition failed.
+    is_shut_down : bool
+        Whether the process or a client shut it down.
+    ports : Ports
+        Makes publishers and subscriptions.
     """
 
     def __init__(self, name: str, declared: tuple[Parameter, ...]) -> None:
@@ -54,7 +59,7 @@ class ManagedNode(LifecycleNode, ABC):
 
     @abstractmethod
     def configure(self) -> None:
-        """Do all that may fail."""
+        """Do all work that may fail."""
 
     @abstractmethod
     def activate(self) -> None:
@@ -70,45 +75,50 @@ class ManagedNode(LifecycleNode, ABC):
 
     @property
     def failure(self) -> str:
-        """Why the node cannot continue; empty otherwise. Read after each callback."""
+        """Return why the node cannot continue; empty otherwise. Read after each callback."""
         return ""
 
     @property
     def has_pending_answers(self) -> bool:
-        """Whether requests are still to be answered before the node is destroyed."""
+        """Return whether requests must still be answered before the node is destroyed."""
         return False
 
     def create_timer(self, *what: Any, **how: Any) -> Timer:
-        """A timer that also runs with ``use_sim_time`` while nobody sends ``/clock``."""
+        """Create a timer that runs even with ``use_sim_time`` while nobody sends ``/clock``."""
         return super().create_timer(*what, **{"clock": self._steady_clock, **how})
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., Any], *what: Any, **how: Any
     ) -> Any:
-        """A subscription whose callback's exception is logged: no message ends the node."""
+        """Create a subscription that logs its callback's exceptions: no message ends the node."""
         heard = never_raising(self, topic, callback)
         return super().create_subscription(msg_type, topic, heard, *what, **how)
 
     def bring_up(self) -> bool:
-        """Configure and activate; false if the node refused."""
+        """Configure and activate; return false if the node refused."""
         return all(
             trigger() == TransitionCallbackReturn.SUCCESS
             for trigger in (self.trigger_configure, self.trigger_activate)
         )
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Configure as a transition; on failure, clean up."""
         return self._attempt(self.configure, self.clean_up)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Activate as a transition; on failure, deactivate."""
         return self._attempt(self.activate, self.deactivate)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Deactivate as a transition."""
         return self._attempt(self.deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Clean up as a transition."""
         return self._attempt(self.clean_up)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Shut down as a transition, from any state."""
         self.is_shut_down = True
         return self._attempt(self.release)
 
@@ -125,7 +135,7 @@ class ManagedNode(LifecycleNode, ABC):
             return TransitionCallbackReturn.SUCCESS
         except (ParameterError, AvatarError, OSError) as error:
             self.refusal = str(error)
-        except Exception as error:  # rclpy would drop it
+        except Exception as error:  # rclpy would drop the error
             self.refusal = f"{type(error).__name__}: {error}"
             traceback.print_exc()
         self.get_logger().error(self.refusal)
@@ -150,12 +160,17 @@ def spin_until(stop: StopSignal, node: Node) -> None:
 
 
 def run(make_node: Callable[[], ManagedNode], keeps_time: bool = False) -> int:
-    """Bring a node up, spin it until SIGINT or SIGTERM, shut it down; returns the exit code.
-
-    keeps_time : no other process may delay what the node publishes
+    """Bring a node up, spin it until SIGINT or SIGTERM, shut it down; return the exit code.
 
     The signal handlers of rclpy are not used: they shut the middleware down while the loop still
     has a last message to send.
+
+    Parameters
+    ----------
+    make_node : callable
+        Makes the node, after ``rclpy.init``.
+    keeps_time : bool
+        Whether no other process may delay what the node publishes.
     """
     stop, code = StopSignal(), 1
     node: ManagedNode | None = None
@@ -184,7 +199,7 @@ def _live(node: ManagedNode, stop: StopSignal) -> int:
     try:
         with stop.interrupts():  # a large organ takes a while to read
             if node.get_parameter("autostart").value and not node.bring_up():
-                return 1  # the reason was logged
+                return 1  # the node has logged the reason
         with stop.wakes(executor):
             while not stop and not node.failure:
                 executor.spin_once()
@@ -192,7 +207,7 @@ def _live(node: ManagedNode, stop: StopSignal) -> int:
             node.get_logger().fatal(node.failure)
         return 1 if node.failure else 0
     except Stopped:
-        leave = node.release  # no other transition leads out of one that has not ended
+        leave = node.release  # no other transition leads out of an unfinished one
         return 0
     finally:
         if not node.is_shut_down:
@@ -200,4 +215,4 @@ def _live(node: ManagedNode, stop: StopSignal) -> int:
         end = time.monotonic() + _LAST_ANSWERS
         while node.has_pending_answers and time.monotonic() < end:
             executor.spin_once(timeout_sec=_LOOK)
-        executor.shutdown(timeout_sec=_LAST_ANSWERS)  # else it waits forever for open requests
+        executor.shutdown(timeout_sec=_LAST_ANSWERS)  # otherwise it waits forever for open requests

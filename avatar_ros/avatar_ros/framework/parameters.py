@@ -12,15 +12,19 @@ from rclpy.node import Node
 
 
 class ParameterError(ValueError):
-    """A parameter has a value that the node cannot work with; the message says what it takes."""
+    """Parameter value that the node cannot use; the message says which values it accepts."""
 
 
 @dataclass(frozen=True)
 class Parameter:
     """One parameter of a node.
 
-    range : smallest and largest value of a number
-    any_type : the type may differ from the default's; checked where it is read
+    Attributes
+    ----------
+    range : tuple of float, optional
+        Smallest and largest value of a number.
+    any_type : bool
+        The type may differ from the default's; the reader of the value checks it.
     """
 
     name: str
@@ -31,6 +35,7 @@ class Parameter:
     any_type: bool = False
 
     def descriptor(self) -> ParameterDescriptor:
+        """Return the descriptor that rclpy declares it with."""
         descriptor = ParameterDescriptor(
             description=self.description, read_only=self.read_only, dynamic_typing=self.any_type
         )
@@ -44,17 +49,19 @@ class Parameter:
         return descriptor
 
     def wanted(self) -> str:
+        """Describe the accepted values, e.g. for an error message."""
         kind = "a number with a decimal point" if isinstance(self.default, float) else "a value"
         bounds = f" from {self.range[0]:g} to {self.range[1]:g}" if self.range else ""
         return f"{kind}{bounds} like {self.default!r}"
 
 
 def declare(node: Node, parameters: tuple[Parameter, ...]) -> None:
-    """Declare all, with the values given by files and command line.
+    """Declare all parameters, with the values given by files and command line.
 
     Raises
     ------
-    ParameterError : a given value has the wrong type or lies out of range
+    ParameterError
+        If a given value has the wrong type or lies out of range.
     """
     for parameter in parameters:
         try:
@@ -71,17 +78,17 @@ def values(node: Node, parameters: tuple[Parameter, ...]) -> dict[str, Any]:
 
 
 def frame(name: str) -> str:
-    """A name that is not empty; raises ParameterError otherwise."""
+    """Return a frame's name; raise ParameterError if it is empty."""
     if not name:
         raise ParameterError("parameter frame_id: give the name of the organ's frame")
     return name
 
 
-IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # as a pose: x y z, quaternion x y z w
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose x y z, quaternion x y z w
 
 
 def pose(name: str, numbers: Any) -> tuple[float, ...]:
-    """A pose x y z [m], quaternion x y z w; raises ParameterError, naming it, if it is none."""
+    """Return a pose x y z [m], quaternion x y z w; raise ParameterError for other numbers."""
     found = tuple(float(number) for number in numbers)
     square = sum(number * number for number in found[3:])
     if len(found) != 7 or not all(map(math.isfinite, found)) or not abs(square - 1.0) < 2e-3:

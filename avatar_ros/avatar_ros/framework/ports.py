@@ -1,7 +1,7 @@
 """Publishers and subscriptions whose quality of service parameters may change.
 
 The parameters are those of rclpy, ``qos_overrides.TOPIC.publisher.POLICY`` or ``.subscription.``;
-:class:`avatar_ros.framework.qos.Quality` says which values pass.
+:class:`avatar_ros.framework.qos.Quality` says which values are accepted.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ POLICIES = (
 )
 
 
-ONE_CELL = (  # the remedy
+ONE_CELL = (  # remedy for several publishers of a topic
     "end all but one (a node that was killed counts for 20 s), or give each cell its own "
     "ROS_DOMAIN_ID or namespace"
 )
-_MAX_LOGGED = 100  # lines; from then on, mismatches are in the diagnostics only
+_MAX_LOGGED = 100  # number of lines; later mismatches are only in the diagnostics
 
 
 class PolledSubscriptions(CallbackGroup):
@@ -52,38 +52,41 @@ class PolledSubscriptions(CallbackGroup):
     """
 
     def can_execute(self, entity: Any) -> bool:
+        """Return false: no callback runs."""
         return False
 
     def beginning_execution(self, entity: Any) -> bool:
+        """Return false: no callback runs."""
         return False
 
     def ending_execution(self, entity: Any) -> None:
+        """Do nothing."""
         pass
 
 
 def publishers(node: Node, topic: str) -> dict[str, str]:
-    """Full name of the node of each publisher of a topic, by the publisher's GID."""
+    """Return the full node name of each publisher of a topic, by the publisher's GID."""
     ends = node.get_publishers_info_by_topic(topic)
     return {bytes(end.endpoint_gid).hex(): _full_name(end) for end in ends}
 
 
 def _full_name(end: TopicEndpointInfo) -> str:
-    """Namespace and name of the node of a publisher, which the middleware learns a little later."""
+    """Return namespace and name of a publisher's node; the middleware learns them a bit later."""
     if end.node_name == "_NODE_NAME_UNKNOWN_":
         return "a node that just joined"
     return f"{end.node_namespace.rstrip('/')}/{end.node_name}"
 
 
 def rivals(node: Node, topic: str) -> str:
-    """Who publishes a topic that should have one publisher; empty if it has one at most."""
-    if node.count_publishers(topic) <= 1:  # which is faster
+    """Name the publishers of a topic that should have only one; empty if it has at most one."""
+    if node.count_publishers(topic) <= 1:  # counting is faster
         return ""
     names = " and ".join(sorted(publishers(node, topic).values()))
     return f"{topic} is published by {names}"
 
 
 def _as_discovered(profile: QoSProfile) -> QoSProfile:
-    """A profile of ours as others find it: what was left to the middleware is infinite."""
+    """Return a profile as other nodes see it: durations left to the middleware are infinite."""
     return QoSProfile(
         depth=profile.depth,
         reliability=profile.reliability,
@@ -99,16 +102,19 @@ class Ports:
 
     Raises
     ------
-    ParameterError : an override has a value that does not pass
+    ParameterError
+        If an override has a value that is not accepted.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._suspects: dict[tuple[str, str], QoSProfile] = {}  # that have had an incompatible end
+        # topics that have had an incompatible end
+        self._suspects: dict[tuple[str, str], QoSProfile] = {}
         self._silent: set[str] = set()  # topics without events: always suspect
         self._logged: set[str] = set()
 
     def publisher(self, kind: type, topic: str, quality: Quality) -> Any:
+        """Make a publisher, with the overrides of its quality of service."""
         profile, name = quality.fresh(), self._node.resolve_topic_name(topic)
         return self._made(
             lambda options: self._node.create_publisher(
@@ -134,7 +140,7 @@ class Ports:
         silent: bool = False,
         **how: Any,
     ) -> Any:
-        """``how`` is passed to rclpy; ``silent``: no executor waits for its events."""
+        """Make a subscription; ``how`` goes to rclpy; ``silent``: no executor takes its events."""
         profile, name = quality.fresh(), self._node.resolve_topic_name(topic)
         events = SubscriptionEventCallbacks(
             incompatible_qos=lambda event: self._log("subscription", name, profile, event)
@@ -159,7 +165,7 @@ class Ports:
         )
 
     def mismatches(self) -> list[str]:
-        """Ends in other nodes that are incompatible with those of this node, one line each.
+        """List ends in other nodes that are incompatible with those of this node, one line each.
 
         Only topics that have had an incompatible end are checked, and silent ones.
         """

@@ -9,8 +9,8 @@ from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 _NONE = Duration()  # no deadline
-_DEADLINE = 10  # offered by publishers [periods]
-_MIN_DEADLINE = 2  # that a parameter may set [periods]
+_DEADLINE = 10  # deadline that publishers offer [periods]
+_MIN_DEADLINE = 2  # shortest deadline that a parameter may set [periods]
 
 # The newest value, sent again to late joiners.
 LATCHED = QoSProfile(
@@ -23,7 +23,7 @@ COMMAND = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 
 
 def state(n_tools: int) -> QoSProfile:
-    """For one message per tool and step on the same topic."""
+    """Return the profile for one message per tool and step on the same topic."""
     return QoSProfile(depth=2 * n_tools, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -34,9 +34,14 @@ STATISTICS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 class Quality:
     """A profile and the limits of its overrides; history and durability cannot be overridden.
 
-    period : of the messages [s], a lower bound of deadlines; infinity: no deadline is possible
-    depths : smallest and largest
-    has_deadline : a deadline of ten periods is offered by default
+    Attributes
+    ----------
+    period : float
+        Period of the messages [s], a lower bound of deadlines; infinity: no deadline.
+    depths : tuple of int
+        Smallest and largest depth.
+    has_deadline : bool
+        Whether a deadline of ten periods is offered by default.
     """
 
     profile: QoSProfile
@@ -45,7 +50,7 @@ class Quality:
     has_deadline: bool = False
 
     def fresh(self) -> QoSProfile:
-        """The profile, for rclpy to write overrides into."""
+        """Return a copy of the profile, for rclpy to write overrides into."""
         own = self.profile
         nanoseconds = round(_DEADLINE * self.period * 1e9) if self.has_deadline else 0
         return QoSProfile(
@@ -56,7 +61,7 @@ class Quality:
         )
 
     def refusal(self, given: QoSProfile) -> str:
-        """The first policy that is refused, why, and what it takes; empty if all pass."""
+        """Name the first refused policy, with the reason and accepted values; empty if all pass."""
         own, (fewest, most) = self.profile, self.depths
         latched = own.durability == DurabilityPolicy.TRANSIENT_LOCAL
         kinds = (ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT)[: 1 if latched else 2]
@@ -85,30 +90,38 @@ ONCE = Quality(LATCHED)
 
 
 def poses(period: float) -> Quality:
-    """One pose is taken per step: a queue would only make poses late. No deadline is requested,
-    because that would exclude every driver that offers none."""
+    """Return the quality of poses: depth one, without a deadline.
+
+    Each step takes one pose: a queue would only make poses late. A requested deadline would exclude
+    every driver that offers none.
+    """
     return Quality(NEWEST, period)
 
 
 def wrenches(period: float) -> Quality:
-    """With a deadline, a driver learns that the stream has stopped. It costs the loop 30 us a step,
-    so no other topic offers one."""
+    """Return the quality of wrenches, with a deadline.
+
+    The deadline tells a driver that the stream has stopped. It costs the loop 30 us per step, so no
+    other topic offers one.
+    """
     return Quality(COMMAND, period, has_deadline=True)
 
 
 def bands(period: float) -> Quality:
-    """As wrenches, but no deadline is offered."""
+    """Return the quality of band edges: as wrenches, but no deadline is offered."""
     return Quality(COMMAND, period)
 
 
 def states(n_tools: int, period: float) -> Quality:
+    """Return the quality of states."""
     return Quality(state(n_tools), period, (n_tools, 1000))
 
 
 def clouds(period: float) -> Quality:
-    """No deadline is offered, because the rate may change at run time."""
+    """Return the quality of clouds: no deadline, because the rate may change at run time."""
     return Quality(NEWEST, period, (1, 10))
 
 
 def reports(period: float) -> Quality:
+    """Return the quality of statistics and other reports."""
     return Quality(STATISTICS, period, (1, 1000))

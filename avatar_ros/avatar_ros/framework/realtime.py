@@ -31,11 +31,16 @@ class _Timespec(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Privileges:
-    """What was granted; for everything that was refused, one line that says how to get it.
+    """Granted privileges, and for each refused one a line that says how to get it.
 
-    priority : of SCHED_FIFO, 0 without
-    cpu : core the loop is bound to, -1 for any
-    memory_locked : pages of the process stay in memory
+    Attributes
+    ----------
+    priority : int
+        SCHED_FIFO priority, 0 without.
+    cpu : int
+        Core the loop is bound to, -1 for any.
+    memory_locked : bool
+        Whether pages of the process stay in memory.
     """
 
     priority: int
@@ -47,8 +52,8 @@ class Privileges:
 def claim(priority: int, cpu: int = -1, lock_memory: bool = True) -> Privileges:
     """Take SCHED_FIFO for every thread of this process, and lock its memory.
 
-    All threads, because a thread of lower priority that holds Python's global lock, or carries
-    the middleware's messages, would hold up the loop. ``cpu`` is checked here and taken by
+    A thread of lower priority may hold Python's global lock or carry the middleware's messages. It
+    would delay the loop, so all threads get the priority. ``cpu`` is checked here and taken by
     ``bind_thread``. Priority 0 asks for nothing and is granted.
     """
     refusals: list[str] = []
@@ -84,13 +89,13 @@ def bind_thread(cpu: int) -> None:
     """Bind the calling thread to one core (-1: leave it) and let its timers fire on time."""
     if cpu >= 0:
         os.sched_setaffinity(0, {cpu})
-    _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)  # else 50 us are added without SCHED_FIFO
+    _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)  # otherwise 50 us are added without SCHED_FIFO
 
 
 def name_thread(name: str) -> None:
-    """Name the calling thread for ``top -H`` and the like, in at most 15 bytes.
+    """Name the calling thread for tools such as ``top -H``, in at most 15 bytes.
 
-    Python before 3.14 names its own threads alone.
+    Python before 3.14 does not pass its thread names on to the system.
     """
     _libc.prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)
 
@@ -105,8 +110,8 @@ def release() -> None:
 def tune_interpreter() -> None:
     """Disable automatic garbage collection, and shorten the switch interval of the global lock.
 
-    The caller has to call ``gc.collect()`` from time to time outside the loop. Objects that exist
-    now are frozen and never examined again, so that takes well below a millisecond.
+    The caller must call ``gc.collect()`` from time to time outside the loop. Objects that exist now
+    are frozen and never examined again, so that collection takes well below a millisecond.
     """
     gc.collect()
     gc.freeze()
@@ -131,7 +136,7 @@ def prefault(pages: np.ndarray) -> None:
 
 
 def die_with_parent(signal_number: int) -> None:
-    """Have the kernel send this process a signal when the thread that started it ends."""
+    """Make the kernel send this process a signal when the thread that started it ends."""
     _libc.prctl(_PR_SET_PDEATHSIG, int(signal_number), 0, 0, 0)
 
 

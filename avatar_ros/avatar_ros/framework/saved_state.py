@@ -1,7 +1,7 @@
 """Changes made while a node ran, saved in a file for its next start.
 
-They are used only if the node is started with the same values as the last time. With other values,
-somebody has made a new choice, and the file is ignored.
+They are used only if the node is started with the same values as the last time. Other values are a
+new choice of the user, and the file is then ignored.
 """
 
 from __future__ import annotations
@@ -28,11 +28,15 @@ STATE_DIR = Parameter(
 class SavedState:
     """The file of one node; without a directory, nothing is saved or loaded.
 
-    started : values that the node is started with, by name; of JSON's types
+    Parameters
+    ----------
+    started : dict
+        Values that the node is started with, by name; JSON types.
 
     Raises
     ------
-    ParameterError : the directory is none, or cannot be written to
+    ParameterError
+        If the directory is missing or cannot be written to.
     """
 
     def __init__(self, node: Node, started: dict[str, Any]) -> None:
@@ -51,7 +55,7 @@ class SavedState:
         self._path = Path(folder).resolve() / f"{name}.json"
 
     def load(self) -> dict[str, Any]:
-        """The saved changes; empty if the node is started with other values now."""
+        """Return the saved changes; empty if the node is now started with other values."""
         if self._path is None or not self._path.exists():
             return {}
         try:
@@ -65,7 +69,7 @@ class SavedState:
             return {}
 
     def save(self, now: dict[str, Any]) -> None:
-        """Write the values that differ from the start, atomically; nothing if nothing is new."""
+        """Write values that differ from the start, atomically; write nothing if none is new."""
         if self._path is None:
             return
         changed = {name: value for name, value in now.items() if value != self._started[name]}

@@ -1,4 +1,4 @@
-"""The template of ContactState, whose number of contacts changes from step to step."""
+"""Template of ContactState, whose number of contacts changes from step to step."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ _CONTACT_NUMBERS = 10  # position, normal, force, penetration
 class StateTemplate:
     """A serialised ContactState with room for ``capacity`` contacts.
 
-    ``contacts`` is a view of their numbers, shape (capacity, 10): position, normal, force,
-    penetration.
+    Attributes
+    ----------
+    contacts : ndarray, shape (capacity, 10)
+        View of their numbers: position, normal, force, penetration.
     """
 
     def __init__(self, frame_id: str, tool: str, vademecum_id: str, capacity: int) -> None:
@@ -38,7 +40,7 @@ class StateTemplate:
         self._status = _find_byte(
             message, lambda status: setattr(message, "status", status), lambda read: read.status
         )
-        # byte of the number of contacts
+        # offset of the number of contacts [bytes]
         least = _find_byte(message, set_count, lambda read: len(read.contacts))
         self._count = least if sys.byteorder == "little" else least - 3
         set_count(capacity)
@@ -67,7 +69,7 @@ class StateTemplate:
         force_share: float = 1.0,
         held: bool = False,
     ) -> bytes:
-        """The message with its first ``n_contacts`` contacts. Real-time safe."""
+        """Return the message with its first ``n_contacts`` contacts. Real-time safe."""
         head = self._head
         head[self._stamp : self._stamp + STAMP_BYTES] = stamp
         head[self._status] = status
@@ -79,7 +81,7 @@ class StateTemplate:
         return bytes(head) + bytes(memoryview(self._block)[:used]) + bytes(self._tail)
 
     def _reads_back(self, n_contacts: int) -> bool:
-        """Whether the middleware reads what was written; padding bytes may have any value."""
+        """Return whether the middleware reads back what was written; padding may hold any value."""
         self.contacts[:] = np.arange(self.contacts.size).reshape(self.contacts.shape)
         sent = self.serialise(struct.pack("=iI", 3, 4), 5, n_contacts, 0.25, 0.5, True)
         read = deserialize_message(sent, ContactState)
@@ -100,7 +102,7 @@ def _contact_numbers(contact: Contact) -> list[float]:
 
 
 def _find_flag(message: ContactState) -> int:
-    """Byte offset of ``held``, the last byte that is other with it than without."""
+    """Return the offset of ``held``: the last byte that changes with it."""
     message.held = True
     with_it = serialize_message(message)
     message.held = False
@@ -115,7 +117,7 @@ def _find_flag(message: ContactState) -> int:
 def _find_byte(
     message: ContactState, set_byte: Callable[[int], None], read_byte: Callable[[ContactState], int]
 ) -> int:
-    """Byte offset of what ``set_byte`` sets: the only byte that follows it and is read back.
+    """Return the offset of the byte that ``set_byte`` sets, the only one that is read back.
 
     A small number cannot be marked, and one comparison is not enough: padding may hold anything,
     even a copy of the number.
@@ -130,7 +132,7 @@ def _find_byte(
     found = []
     for i in follows:
         changed = bytearray(serialised[-1])
-        changed[i] = 4  # fewer than are there, so that no reader runs out of bytes
+        changed[i] = 4  # at most the present number, so that no reader runs out of bytes
         if read_byte(deserialize_message(bytes(changed), ContactState)) == 4:
             found.append(i)
     if len(found) != 1:

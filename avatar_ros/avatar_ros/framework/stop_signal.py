@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM: a flag, and what wakes an executor that waits."""
+"""SIGINT and SIGTERM as a flag, with wake-up of a waiting executor."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 
 class Stopped(BaseException):
-    """A signal came before something was done; nothing but the end of the process handles it."""
+    """Signal during an interruptible body; only the end of the process handles it."""
 
 
 class StopSignal:
-    """True once SIGINT or SIGTERM was received."""
+    """Flag that is true once SIGINT or SIGTERM was received."""
 
     def __init__(self) -> None:
         self._came = self._interrupts = False
@@ -28,7 +28,7 @@ class StopSignal:
     def _note(self, *_: object) -> None:
         self._came = True
         if self._interrupts:
-            self._interrupts = False  # what is released then is not interrupted by another one
+            self._interrupts = False  # further signals do not interrupt the release
             raise Stopped
 
     def __bool__(self) -> bool:
@@ -36,9 +36,9 @@ class StopSignal:
 
     @contextmanager
     def interrupts(self) -> Iterator[None]:
-        """A signal ends the body, whatever it waits for or computes, by :class:`Stopped`.
+        """Let a signal end the body by :class:`Stopped`, whatever it waits for or computes.
 
-        In the main thread, where Python calls its handlers.
+        For the main thread, where Python calls its handlers.
         """
         if self._came:
             raise Stopped
@@ -50,10 +50,11 @@ class StopSignal:
 
     @contextmanager
     def wakes(self, executor: Executor) -> Iterator[None]:
-        """A signal ends the executor's waiting, however long that would be; in the main thread.
+        """Let a signal end the executor's wait, however long that is; for the main thread.
 
-        Python calls its handlers between two instructions of the main thread, of which there are
-        none while that waits for the middleware. Looking ten times a second costs 1 % of a core.
+        Python calls its handlers between two instructions of the main thread, and there are none
+        while
+        the thread waits for the middleware. Looking ten times a second would cost 1 % of a core.
         """
         ours, theirs = socket.socketpair()
         theirs.setblocking(False)
@@ -76,4 +77,4 @@ def _pass_on(signals: socket.socket, executor: Executor) -> None:
 
 
 def _nothing() -> None:
-    """Return."""
+    """Do nothing: the task only wakes the executor."""

@@ -1,6 +1,6 @@
-"""What a loader announces of a vademecum, taken from it in the process that reads the file.
+"""Announcement of a vademecum, read in the process that reads the file.
 
-The loader itself holds neither the arrays of the vademecum nor the libraries that it needs.
+The loader itself holds neither the arrays of the vademecum nor the libraries that read them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from avatar_core.vademecum import storage
 
 
 def summary(content: bytes, origin: str) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
-    """Fields of a VademecumInfo, vertices (n, 3) [m] and faces (m, 3) of the surface.
+    """Return fields of a VademecumInfo, vertices (n, 3) [m] and faces (m, 3) of the surface.
 
     Raises StorageError as ``storage.parse_vademecum`` does.
     """

@@ -1,8 +1,8 @@
 """Messages of the loop, as bytes that were serialised once.
 
 Building and serialising a message object costs a 1 kHz loop in Python a large part of its period. A
-template is a message that is serialised once; only its numbers are then overwritten, and the bytes
-are published as they are. Measured on two shared cores:
+template is a message that is serialised once. Afterwards only its numbers are overwritten, and the
+bytes are published as they are. Measured on two shared cores:
 
 ==================================  ==============  =============
 message                             object          template
@@ -12,9 +12,9 @@ WrenchStamped, published            54 us           4 us
 PoseStamped, taken                  41 us           2 to 5 us
 ==================================  ==============  =============
 
-Where the numbers lie is not computed but searched for, by serialising messages with marks in these
-places, so that templates work with whatever serialisation the middleware uses. The constructors do
-that, and raise LayoutError; ``read`` and ``serialise`` are real-time safe.
+The constructors find the offsets of the numbers by serialising messages with marks in these
+places. Templates therefore work with any serialisation of the middleware; otherwise the
+constructors raise LayoutError. ``read`` and ``serialise`` are real-time safe.
 """
 
 from __future__ import annotations
@@ -35,21 +35,22 @@ from avatar_ros.msg import ContactState
 
 POINT_BYTES = 24  # x y z dx dy dz, float32
 STAMP_BYTES = 8
-_UNIT_NORM_TOLERANCE = 1e-3  # of a quaternion; float32 poses keep 1e-7
+_UNIT_NORM_TOLERANCE = 1e-3  # tolerance of a quaternion's norm; float32 poses keep 1e-7
 _MARK = 0x5A3C_96E1_1EAD_BEEF
 NO_STAMP = bytes(STAMP_BYTES)
 
 
 class LayoutError(RuntimeError):
-    """The middleware's serialisation is not what a template needs."""
+    """The middleware's serialisation does not suit a template."""
 
 
 def find_bytes(mark: bytes, serialised: bytes) -> int:
-    """Byte offset of a mark.
+    """Return the offset of a mark [bytes].
 
     Raises
     ------
-    LayoutError : the mark does not occur exactly once
+    LayoutError
+        If the mark does not occur exactly once.
     """
     start = serialised.find(mark)
     if start < 0 or serialised.find(mark, start + 1) >= 0:
@@ -58,7 +59,7 @@ def find_bytes(mark: bytes, serialised: bytes) -> int:
 
 
 def find_number(message: Any, set_number: Callable[[float], None]) -> int:
-    """Byte offset of the float64 that ``set_number`` sets in ``message``; raises LayoutError."""
+    """Return the offset of the float64 that ``set_number`` sets [bytes]; raise LayoutError."""
     mark: float = struct.unpack("=d", struct.pack("=Q", _MARK))[0]
     set_number(mark)
     start = find_bytes(struct.pack("=d", mark), serialize_message(message))
@@ -67,6 +68,7 @@ def find_number(message: Any, set_number: Callable[[float], None]) -> int:
 
 
 def find_stamp(message: Any) -> int:
+    """Return the offset of a message's time stamp [bytes]; raise LayoutError."""
     message.header.stamp.sec, message.header.stamp.nanosec = 0x5A3C96E1, 0x1EADBEEF
     start = find_bytes(struct.pack("=iI", 0x5A3C96E1, 0x1EADBEEF), serialize_message(message))
     message.header.stamp.sec = message.header.stamp.nanosec = 0
@@ -76,9 +78,14 @@ def find_stamp(message: Any) -> int:
 class PoseReader:
     """Reads serialised PoseStamped of one frame.
 
-    position : of the tip, as read last [m]
-    orientation : as read last, unit quaternion (x, y, z, w)
-    stamp : the eight bytes of the time stamp read last
+    Attributes
+    ----------
+    position : tuple of float
+        Position of the tip, as read last [m].
+    orientation : tuple of float
+        Unit quaternion (x, y, z, w), as read last.
+    stamp : bytes
+        The eight bytes of the time stamp read last.
     """
 
     def __init__(self, frame_id: str) -> None:
@@ -102,7 +109,7 @@ class PoseReader:
         self.stamp = NO_STAMP
 
     def read(self, raw: bytes) -> int:
-        """Read a pose; returns a status of ContactState. Real-time safe.
+        """Read a pose; return a status of ContactState. Real-time safe.
 
         The attributes change only with STATUS_OK.
         """
@@ -124,7 +131,7 @@ class PoseReader:
 def rotated(
     vector: tuple[float, float, float], orientation: tuple[float, float, float, float]
 ) -> tuple[float, float, float]:
-    """A vector in the frame that an orientation is given in. Real-time safe."""
+    """Rotate a vector into the frame in which an orientation is given. Real-time safe."""
     x, y, z = vector
     i, j, k, w = orientation
     a, b, c = 2.0 * (j * z - k * y), 2.0 * (k * x - i * z), 2.0 * (i * y - j * x)
@@ -132,13 +139,13 @@ def rotated(
 
 
 def stamp_nanoseconds(stamp: bytes) -> int:
-    """Time of a stamp since the epoch of its clock [ns]. Real-time safe."""
+    """Return the time of a stamp since the epoch of its clock [ns]. Real-time safe."""
     seconds, nanoseconds = struct.unpack("=iI", stamp)
     return int(seconds * 1_000_000_000 + nanoseconds)
 
 
 def stamp_bytes(nanoseconds: int) -> bytes:
-    """The inverse of :func:`stamp_nanoseconds`. Real-time safe."""
+    """Return the stamp of a time [ns], the inverse of :func:`stamp_nanoseconds`. Real-time safe."""
     return struct.pack("=iI", nanoseconds // 1_000_000_000, nanoseconds % 1_000_000_000)
 
 
@@ -150,7 +157,7 @@ class StampedTemplate:
         self._buffer = bytearray(serialize_message(message))
 
     def serialise(self, stamp: bytes) -> bytes:
-        """The message with this stamp and the numbers of the moment. Real-time safe."""
+        """Return the message with this stamp and the present numbers. Real-time safe."""
         self._buffer[self._stamp : self._stamp + STAMP_BYTES] = stamp
         return bytes(self._buffer)
 
@@ -196,15 +203,20 @@ class WrenchReader:
         self._unpack = struct.Struct("=3d").unpack_from
 
     def read(self, raw: bytes) -> tuple[int, tuple[float, ...]]:
-        """Stamp [ns] and force [N]. Real-time safe."""
+        """Return stamp [ns] and force [N]. Real-time safe."""
         stamp = stamp_nanoseconds(raw[self._stamp : self._stamp + STAMP_BYTES])
         return stamp, self._unpack(raw, self._start)
 
 
 class CloudTemplate:
-    """A serialised PointCloud2; ``points`` is a view of its numbers, shape (n_points, 6).
+    """A serialised PointCloud2.
 
-    start, stamp_start : offsets of these numbers and of the stamp in the message [byte]
+    Attributes
+    ----------
+    points : ndarray, shape (n_points, 6)
+        View of its numbers.
+    start, stamp_start : int
+        Offsets of these numbers and of the stamp in the message [bytes].
     """
 
     def __init__(self, frame_id: str, n_points: int) -> None:
@@ -234,6 +246,6 @@ class CloudTemplate:
         self.points[:] = 0.0
 
     def serialise(self, stamp: bytes) -> bytes:
-        """The message with this stamp and the numbers of the moment. Real-time safe."""
+        """Return the message with this stamp and the present numbers. Real-time safe."""
         self._buffer[self._stamp : self._stamp + STAMP_BYTES] = stamp
         return bytes(self._buffer)

@@ -1,5 +1,6 @@
-"""The 1 kHz loop of the contact node: poses come in, one compiled step runs, and wrench, state and
-cloud go out.
+"""The 1 kHz loop of the contact node.
+
+Poses come in, one compiled step runs, and wrench, state and cloud go out.
 
 A method marked *real-time safe* is meant for the loop: it takes no lock, reads no file, writes no
 log, raises nothing in ordinary use, and allocates no more than the small objects of a Python call.

@@ -1,15 +1,15 @@
 """The loop of the contact node: a thread that waits for a pose, steps and publishes.
 
-It waits for nothing but poses. Without a model it steps every fifth period, and no pose wakes it:
-there is no force to be late, and the wrench of zero keeps its deadline. While no tool is connected
-either, it steps ten times a second, until the node wakes it. An exception ends it, with a last
-wrench of zero. The node exchanges two references with it: the data of the model in use and the
+It waits for nothing but poses. Without a model it steps every fifth period and no pose wakes it:
+there is no force that could be late, and the wrench of zero keeps its deadline. While no tool is
+connected either, it steps ten times a second, until the node wakes it. An exception ends it, with a
+last wrench of zero. The node exchanges two references with it: the data of the model in use and the
 record of times.
 
-When a model replaces another, the loop steps both for ``BLEND`` seconds and publishes a mean of
-both whose weight moves linearly from the old model to the new one.
+When a model replaces another, the loop steps both for ``BLEND`` seconds. It publishes their mean,
+whose weight moves linearly from the old model to the new one.
 
-The band of a force is that of the organ's, whatever of it is sent: it is neither limited nor faded.
+A force's band belongs to the organ's force, before limits and fading.
 
 Before the organ's force is sent to a tool, a guard
 (:mod:`avatar_core.haptics.force_guard`) limits it, fades it out on a fault and lets it come
@@ -44,21 +44,28 @@ NO_MODEL = int(Status.NO_MODEL)
 ENGAGING = int(Status.ENGAGING)
 INACTIVE = int(Status.INACTIVE)
 
-BLEND = 0.1  # [s]
-_LONGEST_WAIT = 1.3  # periods the loop waits for a pose that is due, so as not to miss its own
-_SHORTEST_PERIOD = 0.5  # periods between two answers to poses, however fast they come
-_IDLE = 5  # periods from step to step without a model; the wrench has a deadline of ten
-_ALONE = 100_000_000  # the same, while no tool is connected [ns]
-_NO_ERROR = float("nan")  # of a force that no model gave
+BLEND = 0.1  # time in which a new model takes over [s]
+# longest wait for a pose that is due [periods], so that none is missed by a little
+_LONGEST_WAIT = 1.3
+_SHORTEST_PERIOD = 0.5  # shortest time between two answers [periods], however fast poses come
+_IDLE = 5  # time between steps without a model [periods]; the wrench has a deadline of ten
+_ALONE = 100_000_000  # time between steps while no tool is connected either [ns]
+_NO_ERROR = float("nan")  # error of a force that no model gave
 
 
 class ActiveModel:
     """Data of a contact model with the message templates of its size; the loop exchanges both.
 
-    data : ContactData; None without a model
-    effects : names of the effects that it simulates
-    shown_modes : which of its modes are shown, and how accurate these are
-    band : of its forces; None without distributions of the material
+    Attributes
+    ----------
+    data : ContactData, optional
+        Data of the model; None without a model.
+    effects : tuple of str
+        Names of the effects that the model simulates.
+    shown_modes : ShownModes
+        Modes that are shown, and their accuracy.
+    band : ForceBand, optional
+        Band of its forces; None without distributions of the material.
     """
 
     def __init__(
@@ -98,12 +105,19 @@ class Publishers:
 class ContactLoop:
     """Answers every pose at once, and keeps its period when none comes.
 
-    active : the model in use; exchange it while ``is_changing`` is false, for a smooth change, and
-        ``wake`` the loop
-    record : of the times; exchange it at any time
-    failure : the exception that ended the loop; empty otherwise
-    guards : of the force on each tool
-    energies : of each tool; None unless ``safety.passivity`` asks for them
+    Attributes
+    ----------
+    active : ActiveModel
+        The model in use. Exchange it while ``is_changing`` is false, for a smooth change, and
+        ``wake`` the loop.
+    record : TimingRecord
+        Times of the steps; exchange it at any time.
+    failure : str
+        The exception that ended the loop; empty otherwise.
+    guards : list of ForceGuard
+        Guard of the force on each tool.
+    energies : Passivity, optional
+        Energies of each tool; None unless ``safety.passivity`` asks for them.
     """
 
     def __init__(
@@ -122,10 +136,10 @@ class ContactLoop:
         self._tips = np.full((len(tools), 3), FAR_AWAY)
         self._orientations = np.zeros((len(tools), 4))
         self._jaws = np.zeros(len(tools), np.bool_)
-        self._used = self.active  # of the last step
-        self._outgoing: Any = None  # the model that it replaces, while both are stepped,
-        self._outgoing_band: ForceBand | None = None  # and its band
-        self._blend = 1.0  # of the model in use, in what is published
+        self._used = self.active  # model of the last step
+        self._outgoing: Any = None  # replaced model, while both are stepped
+        self._outgoing_band: ForceBand | None = None  # band of the replaced model
+        self._blend = 1.0  # weight of the model in use in what is published
         self._part_per_step = 1.0 / max(1, round(BLEND * settings.rate))
         self._wait_set = _rclpy.WaitSet(len(tools), 0, 0, 0, 0, 0, context.handle)
         self._period = round(1e9 / settings.rate)
@@ -133,15 +147,15 @@ class ContactLoop:
         self._stopping = False
         self._awake = threading.Event()
         self._thread: threading.Thread | None = None
-        self._step_start = 0  # of the last step [ns]
-        self._due = 0  # the next step, if no pose comes before [ns]
-        self._nominal = self._period  # from the last step to the next [ns]
+        self._step_start = 0  # start of the last step [ns]
+        self._due = 0  # time of the next step, if no pose comes before [ns]
+        self._nominal = self._period  # planned time from the last step to the next [ns]
         self._answered = 0  # start of the last step that had a new pose [ns]
         self._cycle = 0
 
     @property
     def is_changing(self) -> bool:
-        """Whether the loop still steps a replaced model, or has not seen the new one yet."""
+        """Return whether the loop still steps a replaced model, or has not seen the new one yet."""
         changing = self._outgoing is not None or self._used is not self.active
         return self._running and not self.failure and changing
 
@@ -153,7 +167,7 @@ class ContactLoop:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread; returns when all forces have faded out, within 20 ms."""
+        """End the thread; return when all forces have faded out, within 20 ms."""
         self._stopping = True
         self.wake()
         if self._thread is not None:
@@ -169,7 +183,8 @@ class ContactLoop:
         try:
             with ExitStack() as in_use:
                 for port in self._ports():
-                    in_use.enter_context(port.handle)  # not destroyed under the loop
+                    # keeps the handle from being destroyed under the loop
+                    in_use.enter_context(port.handle)
                 in_use.enter_context(self._wait_set)
                 realtime.name_thread("contact loop")
                 realtime.bind_thread(cpu)
@@ -255,7 +270,7 @@ class ContactLoop:
             stamp = self._tools[0].stamp
             self._publishers.deformation.handle.publish_raw(active.cloud.serialise(stamp))
         if self._blend == 1.0:
-            # Freed outside the loop, by the thread that exchanged the model.
+            # the thread that exchanged the model frees it, outside the loop
             self._outgoing = self._outgoing_band = None
 
     def _begin_change(self, active: ActiveModel) -> None:
@@ -272,37 +287,37 @@ class ContactLoop:
         self._outgoing, self._used = outgoing, active
 
     def _solve(self, data: Any) -> None:
-        """Forces at the tips of the moment. Real-time safe."""
+        """Compute the forces at the present tips. Real-time safe."""
         contact.solve(data.model, data, self._tips, self._orientations, self._jaws)
 
     def _take_jaws(self) -> None:
-        """Which jaws are closed. Real-time safe."""
+        """Note which jaws are closed. Real-time safe."""
         for i, tool in enumerate(self._tools):
             if tool.jaw is not None:
                 self._jaws[i] = tool.jaw.take()
 
     def _blend_bands(self, band: ForceBand | None, outgoing: ForceBand | None) -> None:
-        """Fade in the band of a model, of forces that are not faded in yet. Real-time safe."""
+        """Fade in the band of a model, before its forces are faded in. Real-time safe."""
         if band is not None and outgoing is not None:
             band.update()
             outgoing.update()
             _fade_in(band.edges, outgoing.edges, self._blend)
 
     def _publish_bands(self, band: ForceBand) -> None:
-        """Send both edges of each tool's force, after the force itself. Real-time safe."""
+        """Send both edges of each tool's band, after the force itself. Real-time safe."""
         if self._outgoing_band is None:
             band.update()
         for i, tool in enumerate(self._tools):
             tool.send_band(band.edges[:, i])
 
     def _idle_period(self, timeout: int) -> int:
-        """From step to step without a model; short enough that no pose seems late [ns]."""
+        """Return the time between steps without a model: short, so that no pose seems late [ns]."""
         if not any(tool.connected for tool in self._tools):
             return max(self._period, _ALONE)
         return self._period * max(1, min(_IDLE, timeout // (4 * self._period)))
 
     def _next_due(self, start: int, fresh: bool) -> int:
-        """When to step without a pose; later if one is expected. Real-time safe."""
+        """Return when to step without a pose; later if one is expected. Real-time safe."""
         if fresh and self._nominal == self._period:
             return start + round(_LONGEST_WAIT * self._period)
         due = self._due + self._nominal
@@ -361,7 +376,7 @@ class ContactLoop:
 
 
 def _fade_in(new: np.ndarray, old: np.ndarray, blend: float) -> None:
-    """``new`` becomes ``blend * new + (1 - blend) * old``; overwrites ``old``. Real-time safe.
+    """Replace ``new`` by ``blend * new + (1 - blend) * old``; overwrite ``old``. Real-time safe.
 
     The next step computes both again.
     """
@@ -371,7 +386,7 @@ def _fade_in(new: np.ndarray, old: np.ndarray, blend: float) -> None:
 
 
 def _write_contacts(template: StateTemplate, out: Any, tool: int) -> int:
-    """Copy a tool's contacts into its message; returns their number. Real-time safe."""
+    """Copy a tool's contacts into its message; return their number. Real-time safe."""
     total = int(out.n_contacts[0])
     if total == 0:
         return 0

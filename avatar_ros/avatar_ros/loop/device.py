@@ -1,8 +1,8 @@
-"""The device of a tool as its driver describes it, by ``operating_state`` and ``state_command``.
+"""The device of a tool, as its driver describes it by ``operating_state`` and ``state_command``.
 
-A device is ready, as CRTK has it, when it is enabled and homed. Drivers say so when it changes and
-keep the last word for late listeners: how old it is means nothing, that its publisher is gone does.
-All of this is the node's; the loop reads ``ToolChannel.device``.
+A device is ready, in CRTK's terms, when it is enabled and homed. Drivers publish the state when it
+changes and keep the last message for late listeners. So an old message is still valid, but a
+missing publisher is not. The node alone uses this file; the loop reads ``ToolChannel.device``.
 """
 
 from __future__ import annotations
@@ -28,13 +28,16 @@ _STATES = ("DISABLED", "ENABLED", "PAUSED", "FAULT")
 
 
 class ToolDevice:
-    """Hears one device, tells its tool's channel, and sends it the commands that were asked for.
+    """Hears one device, tells its tool's channel, and sends the commands that parameters ask for.
 
-    A command is sent once after ``begin``, to a device that says it needs it: ``enable`` if it is
-    disabled, ``home`` if it is enabled, idle and not homed. One that was ready is sent nothing any
-    more, nor is one that is paused or in fault: somebody decided that.
+    After ``begin`` each command is sent at most once: ``enable`` to a disabled device, ``home`` to
+    one that is enabled, idle and not homed. A device that was ready once gets no further command. A
+    device that is paused or in fault gets none either, because a person decided that.
 
-    subscription, publisher : of the two topics, made by :func:`devices`; None without commands
+    Attributes
+    ----------
+    subscription, publisher : optional
+        Ends of the two topics, made by :func:`devices`; no publisher without commands.
     """
 
     def __init__(
@@ -53,7 +56,7 @@ class ToolDevice:
         self._to_send = self._commands
 
     def hear(self, message: OperatingState) -> None:
-        """Take what the device says."""
+        """Note the state that the device published."""
         state = message.state if message.state in _STATES else "an unknown state"
         self._tool.operating_state = f"{state}, {'' if message.is_homed else 'not '}homed"
         self._wanted = ""
@@ -68,7 +71,7 @@ class ToolDevice:
             self._to_send = ()
 
     def attend(self) -> str:
-        """Forget a device that is gone; returns the command that was sent, or an empty text."""
+        """Forget a device that is gone; return the command that was sent, or an empty text."""
         if self.subscription.get_publisher_count() == 0:
             self._tool.operating_state = self._wanted = ""
             self._tell(NOTHING_SAID)
@@ -88,7 +91,7 @@ class ToolDevice:
 
 
 def devices(node: Node, settings: LoopSettings, tools: Sequence[ToolChannel]) -> list[ToolDevice]:
-    """The devices of all tools that have one, if ``tool_operating_state`` asks for them."""
+    """Make the devices of all tools that have one, if ``tool_operating_state`` asks for them."""
     made = []
     for name, tool in zip(settings.tools, tools, strict=True):
         safety = settings.safety_of(name)

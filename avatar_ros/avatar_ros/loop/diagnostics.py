@@ -1,6 +1,6 @@
 """Diagnostics of the contact node: levels, texts and numbers for `/diagnostics`.
 
-The hardware of a tool is where its driver has it, such as ``/MTML``; that of all else the host.
+The hardware id of a tool is the namespace of its driver, such as ``/MTML``, and else the host.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from avatar_ros.loop.statuses import EXPLANATIONS, explanation
 from avatar_ros.loop.tool_channel import ToolChannel
 from avatar_ros.msg import LoopStatistics
 
-_WITH_FORCE = (Status.NOT_CONVERGED, Status.EXTRAPOLATED)  # faults that do not set it to zero
+# faults that do not set the force to zero
+_WITH_FORCE = (Status.NOT_CONVERGED, Status.EXTRAPOLATED)
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
@@ -30,8 +31,12 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 class Faults:
     """Faults of one tool in a window: how often each status was entered, and the present one.
 
-    said : the operating state of its device, in words; empty if it is not asked or said none
-    senders : names of the nodes that send its poses
+    Attributes
+    ----------
+    said : str
+        Operating state of its device, in words; empty if the device is not heard or silent.
+    senders : tuple of str
+        Names of the nodes that send its poses.
     """
 
     counts: dict[int, int]
@@ -41,7 +46,7 @@ class Faults:
 
     @property
     def text(self) -> str:
-        """Cause and remedy in one line; empty without a fault."""
+        """Return cause and remedy in one line; empty without a fault."""
         status = self.status
         if status not in EXPLANATIONS:
             entered = [key for key in self.counts if key in EXPLANATIONS]
@@ -56,14 +61,14 @@ class Faults:
 
 
 class FaultCounter:
-    """Counts the faults of each tool from call to call."""
+    """Counter of the faults of each tool between two calls."""
 
     def __init__(self, tools: Sequence[ToolChannel]) -> None:
         self._tools = tools
         self._seen = [tool.faults.copy() for tool in tools]
 
     def window(self) -> list[Faults]:
-        """The faults of each tool since the last call."""
+        """Return the faults of each tool since the last call."""
         found = []
         for i, tool in enumerate(self._tools):
             now = tool.faults.copy()
@@ -79,7 +84,7 @@ class FaultCounter:
 def loop_status(
     name: str, window: LoopStatistics, nominal: float, limits: dict[str, float]
 ) -> DiagnosticStatus:
-    """Status of the loop's rate and step; ``limits`` are the values of ``THRESHOLDS``."""
+    """Return the status of the loop's rate and step; ``limits``: values of ``THRESHOLDS``."""
     missed = window.missed / max(window.periods, 1)
     measured = {
         "periodicity.mean_error": abs(window.rate - nominal),
@@ -130,10 +135,10 @@ def tool_status(
     energies: Passivity | None,
     i: int,
 ) -> DiagnosticStatus:
-    """Status of one tool: its faults, limits of the force, and energies if they are observed."""
+    """Return the status of one tool: faults, force limits, and energies if they are observed."""
     values: dict[str, Any] = {
         "publishers of poses": tool.publishers,
-        "share of the force sent": guard.sent_fraction,
+        "fraction of the force sent": guard.sent_fraction,
         "limited": guard.limited,
         "largest force [N]": guard.limits.force,
         "largest slew [N/s]": guard.limits.slew,
@@ -148,30 +153,30 @@ def tool_status(
     if not text and guard.limited:
         text = f"force limited to {guard.limits.force:g} N and {guard.limits.slew:g} N/s"
     elif not text:
-        text, level = "poses sound, force sent whole", OK
+        text, level = "poses valid, full force sent", OK
     hardware = tool.subscription.topic_name.rpartition("/")[0]
     return _status(f"{name}: {tool_name}", level, text, values, hardware)
 
 
 def vademecum_status(name: str, identity: str, accuracy: str) -> DiagnosticStatus:
-    """Status of the loaded vademecum, with its certified errors."""
+    """Return the status of the loaded vademecum, with its certified errors."""
     if not identity:
         return _status(f"{name}: vademecum", WARN, "none: no force; load one", {})
     return _status(f"{name}: vademecum", OK, accuracy, {"id": identity})
 
 
 def cells_status(name: str, rivals: Sequence[str]) -> DiagnosticStatus:
-    """Status of topics that another cell publishes, too; ``rivals`` are one line each."""
+    """Return the status of topics that another cell also publishes; ``rivals``: a line each."""
     if not rivals:
         return _status(f"{name}: other cells", OK, "none was found", {})
     return _status(f"{name}: other cells", ERROR, f"{'; '.join(rivals)}: {ONE_CELL}", {})
 
 
 def qos_status(name: str, mismatches: list[str]) -> DiagnosticStatus:
-    """Status of incompatible ends in other nodes; ``mismatches`` are one line each."""
+    """Return the status of incompatible ends in other nodes; ``mismatches``: a line each."""
     text = "; ".join(mismatches)
     if not text:
-        return _status(f"{name}: quality of service", OK, "no other end was found not to match", {})
+        return _status(f"{name}: quality of service", OK, "no mismatched end was found", {})
     return _status(
         f"{name}: quality of service",
         WARN,
@@ -181,7 +186,7 @@ def qos_status(name: str, mismatches: list[str]) -> DiagnosticStatus:
 
 
 def accuracy_status(name: str, text: str, shedding: bool, window: LoopStatistics) -> Any:
-    """Status of the shown modes, their certified errors and measured times."""
+    """Return the status of the shown modes, their certified errors and measured times."""
     return _status(
         f"{name}: accuracy",
         WARN if shedding else OK,

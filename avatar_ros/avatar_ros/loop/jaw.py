@@ -1,7 +1,7 @@
-"""The jaw of a tool, as its driver says in ``NAME/jaw/measured_js``: open or closed.
+"""The jaw of a tool, open or closed, as its driver publishes it on ``NAME/jaw/measured_js``.
 
 CRTK gives the jaw as the first joint of a sensor_msgs/JointState, 0 where its plates meet. It is
-closed below one position and open again above another, so that noise does not let tissue go.
+closed below one position and open again above another, so that noise does not release tissue.
 """
 
 from __future__ import annotations
@@ -33,16 +33,17 @@ JAW = (
         read_only=False,
     ),
 )
-_LONGEST = 4096  # of a message that is read [bytes]
-_MOST_NAMES = 64  # of joints that are passed over
+_LONGEST = 4096  # longest message that is read [bytes]
+_MOST_NAMES = 64  # most joint names that are skipped
 
 
 def chosen_jaw(value: dict[str, Any]) -> tuple[float, float]:
-    """Positions below which a jaw is closed, and above which it is open.
+    """Return the positions below which a jaw is closed, and above which it is open.
 
     Raises
     ------
-    ParameterError : the second is the smaller one
+    ParameterError
+        If the second is the smaller one.
     """
     closed, opened = value["jaw.closed"], value["jaw.open"]
     if opened < closed:
@@ -53,15 +54,15 @@ def chosen_jaw(value: dict[str, Any]) -> tuple[float, float]:
 
 
 class JointReader:
-    """Reads the first position of a serialised JointState, whatever its joints are called."""
+    """Reader of the first position in a serialised JointState, whatever the joints' names."""
 
     def __init__(self) -> None:
         self._encoding = serialize_message(JointState())[:2]
 
     def read(self, raw: bytes) -> float:
-        """The position, NaN if there is none. Real-time safe.
+        """Return the position, NaN if there is none. Real-time safe.
 
-        CDR has, behind the four bytes of the encoding, stamp, frame, names and positions.
+        CDR holds, after the four bytes of the encoding, stamp, frame, names and positions.
         """
         if raw[:2] != self._encoding or len(raw) > _LONGEST:
             return math.nan
@@ -80,12 +81,12 @@ class JointReader:
 
 
 def _aligned(at: int, size: int) -> int:
-    """The next offset where a number of a size may begin, counted behind the encoding."""
+    """Return the next offset that is aligned to a size, counted behind the encoding."""
     return ((at - 4 + size - 1) & -size) + 4
 
 
 def _after_text(raw: bytes, at: int) -> int:
-    """Offset behind a text that begins at an offset. Real-time safe."""
+    """Return the offset behind a text that begins at an offset. Real-time safe."""
     (length,) = struct.unpack_from("=I", raw, at)
     return at + 4 + int(length)
 
@@ -93,8 +94,12 @@ def _after_text(raw: bytes, at: int) -> int:
 class JawChannel:
     """The jaw of one tool.
 
-    thresholds : positions below which it is closed, and above which it is open
-    shut : whether it is closed; before the first message it is open
+    Attributes
+    ----------
+    thresholds : tuple of float
+        Positions below which the jaw is closed, and above which it is open.
+    shut : bool
+        Whether the jaw is closed; open before the first message.
     """
 
     def __init__(self, subscription: Any, thresholds: tuple[float, float]) -> None:
@@ -105,7 +110,7 @@ class JawChannel:
         self._reader = JointReader()
 
     def take(self) -> bool:
-        """Take the newest message, if any; whether the jaw is closed. Real-time safe."""
+        """Take the newest message, if any; return whether the jaw is closed. Real-time safe."""
         taken = self.subscription.handle.take_message(JointState, True)
         if taken is not None:
             position = self._reader.read(taken[0])
@@ -121,7 +126,7 @@ def jaw_channel(
     period: float,
     polled: PolledSubscriptions,
 ) -> JawChannel:
-    """The jaw of a tool, whose messages the loop takes itself."""
+    """Make the channel of a tool's jaw; the loop takes its messages itself."""
     subscription = ports.subscription(
         JointState,
         f"{name}/jaw/measured_js",

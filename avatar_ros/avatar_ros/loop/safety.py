@@ -10,10 +10,10 @@ from avatar_core.haptics.passivity import MAX_DELAY, Passivity, make_passivity
 from avatar_ros.framework.parameters import IDENTITY, Parameter, ParameterError, pose
 
 PASSIVITY = ("off", "observe", "control")
-# How a wrench is given, and the topic below that of the tool, as CRTK calls them.
+# forms of a wrench, and for each the topic below the tool's, as CRTK calls them
 WRENCHES = {"absolute": "servo_cf", "body": "body/servo_cf", "spatial": "spatial/servo_cf"}
-BAND = ("force_low", "force_high")  # topics of a band's edges, beside that of the wrench
-# What tool_state_command may ask for, and the commands of CRTK that it takes.
+BAND = ("force_low", "force_high")  # topics of a band's edges, next to the wrench's topic
+# values of tool_state_command, with the commands of CRTK that each allows
 COMMANDS: dict[str, tuple[str, ...]] = {"": (), "enable": ("enable",), "home": ("enable", "home")}
 _DEVICE = "sigma"
 
@@ -77,13 +77,13 @@ SAFETY = (
     Parameter(
         "tool_operating_state",
         False,
-        "hear NAME/operating_state, and send no force until the device is enabled and homed",
+        "read NAME/operating_state, and send no force until the device is enabled and homed",
     ),
     Parameter(
         "tool_state_command",
         "",
-        "what a device that is not ready is asked for, once after activation, on "
-        "NAME/state_command: enable or home (it may move); empty: nothing",
+        "command sent once after activation, to a device that is not ready, on "
+        "NAME/state_command: enable or home (it may move); empty: none",
     ),
 )
 
@@ -92,15 +92,26 @@ SAFETY = (
 class Safety:
     """Limits of the force, the definition of a fault, and the observer of the energy.
 
-    leap : [m] in 2 ms
-    passivity : one of ``PASSIVITY``
-    delay : [periods]
-    resolution : [m]
-    frame : of the poses; empty for the organ's
-    transform : pose of that frame in the organ's, x y z [m] and quaternion x y z w
-    wrench : one of ``WRENCHES``
-    hears_state : whether devices have to say that they are enabled and homed
-    commands : those of ``COMMANDS`` that a device may be sent
+    Attributes
+    ----------
+    leap : float
+        Distance between poses in 2 ms that counts as a fault [m].
+    passivity : str
+        One of ``PASSIVITY``.
+    delay : int
+        Delay from a pose to its force on the device [periods].
+    resolution : float
+        Resolution of the device's positions [m].
+    frame : str
+        Frame of the poses; empty for the organ's.
+    transform : tuple of float
+        Pose of that frame in the organ's, x y z [m] and quaternion x y z w.
+    wrench : str
+        One of ``WRENCHES``.
+    hears_state : bool
+        Whether devices must report that they are enabled and homed.
+    commands : tuple of str
+        Commands of ``COMMANDS`` that a device may be sent.
     """
 
     limits: ForceLimits = DEVICES[_DEVICE]
@@ -115,29 +126,30 @@ class Safety:
     commands: tuple[str, ...] = ()
 
     def of_software(self) -> Safety:
-        """The same for a tool that is no device and speaks in the organ's frame."""
+        """Return the settings for a program, not a device, that uses the organ's frame."""
         return replace(
             self, frame="", transform=IDENTITY, wrench="absolute", hears_state=False, commands=()
         )
 
     def observer(self, n_tools: int, period: float) -> Passivity | None:
-        """The observer of the energies; None if passivity is off."""
+        """Return the observer of the energies; None if passivity is off."""
         if self.passivity == "off":
             return None
         return make_passivity(n_tools, self.delay, self.resolution, period)
 
 
 def band_topics(wrench: str) -> tuple[str, ...]:
-    """Topics of the edges of a force's band, for one of ``WRENCHES``; the low edge first."""
+    """Return the topics of a band's edges, the low edge first; ``wrench``: one of ``WRENCHES``."""
     return tuple(WRENCHES[wrench].replace("servo_cf", edge) for edge in BAND)
 
 
 def chosen_safety(value: dict[str, Any]) -> Safety:
-    """The settings that the parameters give.
+    """Return the settings that the parameters give.
 
     Raises
     ------
-    ParameterError : naming the parameter and what it takes
+    ParameterError
+        If a value is not accepted; names the parameter and the accepted values.
     """
     device = DEVICES.get(value["safety.device"])
     if device is None:

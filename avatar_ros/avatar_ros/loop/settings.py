@@ -30,7 +30,7 @@ def _threshold(name: str, warn: float, error: float, what: str) -> tuple[Paramet
     )
 
 
-# The first two are those of ros2_control's controller manager.
+# the first two are those of ros2_control's controller manager
 THRESHOLDS = (
     *_threshold("periodicity.mean_error", 5.0, 10.0, "deviation from the nominal rate [Hz]"),
     *_threshold(
@@ -39,7 +39,7 @@ THRESHOLDS = (
     *_threshold("missed", 0.01, 0.05, "fraction of periods longer than 1.5 nominal ones"),
 )
 
-# Each holds one value, or an array of one for each tool.
+# each holds one value, or an array with one for each tool
 TIP = (
     Parameter(
         "tip.shape",
@@ -65,7 +65,7 @@ CONTACT = (
     Parameter(
         "parent_frame",
         "world",
-        "frame in which tf_static says where the organ lies; empty, or tool_frame: it does not say",
+        "frame in which tf_static places the organ; empty, or tool_frame: it is not published",
     ),
     Parameter(
         "parent_transform",
@@ -76,8 +76,8 @@ CONTACT = (
     Parameter(
         "software_tools",
         "",
-        "those of tools, one or several, that are no devices, as those of the planning page and of "
-        "Slicer: tool_frame, tool_transform, tool_wrench and tool_operating_state are not theirs",
+        "tools, one or several, that are moved by programs such as the planning page or Slicer: "
+        "tool_frame, tool_transform, tool_wrench and tool_operating_state do not apply to them",
         any_type=True,
     ),
     *TIP,
@@ -99,7 +99,7 @@ CONTACT = (
     Parameter(
         "modes",
         0,
-        "modes of the displacement that move a vertex, in the mean; 0: all",
+        "mean number of displacement modes that move a vertex; 0: all",
         range=(0, 100_000),
     ),
     Parameter(
@@ -152,7 +152,7 @@ CONTACT = (
     Parameter(
         "uncertainty",
         "",
-        "what is known of the material, for NAME/force_low and force_high: a file in "
+        "distributions of the material, for NAME/force_low and force_high: a file in "
         "params/uncertainty, or a path (with a /); empty: no bands",
         read_only=False,
     ),
@@ -166,7 +166,7 @@ CONTACT = (
     Parameter(
         "accuracy.quantity",
         "l2",
-        "quantity whose error that is: l2 (displacement) or force",
+        "quantity of accuracy.tolerance: l2 (displacement) or force",
         read_only=False,
     ),
     Parameter(
@@ -189,10 +189,10 @@ CONTACT = (
     *THRESHOLDS,
     STATE_DIR,
 )
-# What a restarted contact node restores, besides the scene.
+# restored by a restarted contact node, besides the scene
 CHANGEABLE = tuple(p.name for p in CONTACT if not p.read_only)
 
-# The core's names of the coordinates that these parameters set.
+# the core's names of the coordinates that these parameters set
 MATERIAL = {
     "material.young_modulus": "young",
     "material.poisson_ratio": "poisson",
@@ -206,13 +206,22 @@ MATERIAL = {
 class LoopSettings:
     """Parameters of the contact node; rates [Hz], times [s].
 
-    scene : YAML, checked; empty for the natural effects of the vademecum
-    parent_frame, parent_transform : for tf2; the pose of the organ's frame there, or an empty name
-    material : values chosen, by name of the coordinate; the others are those of the vademecum
-    budget : of error and time; None for none
-    known : what is known of the material, by name of the coordinate; empty for no bands
-    software_tools : those of ``tools`` that are no devices
-    jaw : positions below which a jaw is closed, and above which it is open
+    Attributes
+    ----------
+    scene : str
+        Checked YAML; empty for the natural effects of the vademecum.
+    parent_frame, parent_transform : str, tuple of float
+        Pose of the organ's frame in its parent, for tf2; without a name none is published.
+    material : dict
+        Values chosen, by coordinate; the others are those of the vademecum.
+    budget : Budget, optional
+        Budget of error and time; None for none.
+    known : dict
+        Distributions of the material, by coordinate; empty for no bands.
+    software_tools : tuple of str
+        The ``tools`` that programs move, not devices.
+    jaw : tuple of float
+        Positions below which a jaw is closed, and above which it is open.
     """
 
     tools: tuple[str, ...]
@@ -237,16 +246,17 @@ class LoopSettings:
     jaw: tuple[float, float] = (0.1, 0.2)
 
     def safety_of(self, tool: str) -> Safety:
-        """That of one of the tools."""
+        """Return the safety settings of one of the tools."""
         return self.safety.of_software() if tool in self.software_tools else self.safety
 
 
 def chosen_software_tools(value: Any, tools: tuple[str, ...]) -> tuple[str, ...]:
-    """The tools that the parameter ``software_tools`` names.
+    """Return the tools that the parameter ``software_tools`` names.
 
     Raises
     ------
-    ParameterError : for a name that is none of the tools'
+    ParameterError
+        If a name is none of the tools'.
     """
     named = value if isinstance(value, list) else [value]
     chosen = tuple(name for name in named if name != "")
@@ -260,11 +270,12 @@ def chosen_software_tools(value: Any, tools: tuple[str, ...]) -> tuple[str, ...]
 
 
 def chosen_tips(value: dict[str, Any], n_tools: int) -> tuple[Tip, ...]:
-    """The tips that the parameters tip.* describe, one for each tool.
+    """Return the tips that the parameters tip.* describe, one for each tool.
 
     Raises
     ------
-    ParameterError : naming the parameter and what it takes
+    ParameterError
+        If a value is not accepted; names the parameter and the accepted values.
     """
     columns = [_of_each_tool(p.name, value[p.name], n_tools) for p in TIP]
     return tuple(_tip(*row) for row in zip(*columns, strict=True))
@@ -290,16 +301,17 @@ def _tip(shape: Any, radius: Any, half_angle: Any, rounding: Any) -> Tip:
 
 
 def chosen_material(value: dict[str, Any]) -> dict[str, float]:
-    """The values of the material that differ from the vademecum's, by coordinate."""
+    """Return the values of the material that differ from the vademecum's, by coordinate."""
     return {name: value[key] for key, name in MATERIAL.items() if value[key] != 0.0}
 
 
 def chosen_known(value: str) -> dict[str, Distribution]:
-    """What the file that the parameter ``uncertainty`` names says; empty if it names none.
+    """Read the file that the parameter ``uncertainty`` names; return nothing if it names none.
 
     Raises
     ------
-    ParameterError : the file is not there, or says something else
+    ParameterError
+        If the file is missing or holds no distributions.
     """
     try:
         return read_distributions(distribution_file(value)) if value else {}
@@ -308,11 +320,12 @@ def chosen_known(value: str) -> dict[str, Distribution]:
 
 
 def chosen_budget(value: dict[str, Any]) -> Budget | None:
-    """The budget of the parameters accuracy.*; None if they set none.
+    """Return the budget of the parameters accuracy.*; None if they set none.
 
     Raises
     ------
-    ParameterError : naming the parameter and what it takes
+    ParameterError
+        If a value is not accepted; names the parameter and the accepted values.
     """
     if value["accuracy.quantity"] not in get_args(Quantity):
         raise ParameterError(f"parameter accuracy.quantity: give {' or '.join(get_args(Quantity))}")

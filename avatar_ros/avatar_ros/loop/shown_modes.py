@@ -1,4 +1,4 @@
-"""How many modes of the model in use are shown, and the errors certified for them."""
+"""Number of shown modes of the model in use, and the errors certified for them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from avatar_core.haptics.shedding import Shedder
 from avatar_core.vademecum.accuracy import AccuracyCurve, Budget, choose, mode_levels
 from avatar_ros.msg import LoopStatistics
 
-LEAST_SHOWN = 3  # modes: with fewer, the organ under a tip no longer looks right
+LEAST_SHOWN = 3  # least modes: with fewer, the organ under a tip no longer looks right
 _NAN = float("nan")
 
 
@@ -18,8 +18,12 @@ _NAN = float("nan")
 class ShownModesReport:
     """One line on the shown modes, for logs and diagnostics.
 
-    shedding : modes are left out because the machine is busy
-    changed : the number of modes differs from that of the last window
+    Attributes
+    ----------
+    shedding : bool
+        Whether modes are left out because the machine is busy.
+    changed : bool
+        Whether the number of modes differs from that of the last window.
     """
 
     text: str
@@ -33,7 +37,9 @@ class ShownModes:
     Parameters
     ----------
     data : ContactData
-    curve : of its cloud; None where none was measured
+        Data of the loop.
+    curve : AccuracyCurve, optional
+        Accuracy of its cloud; None where none was measured.
     """
 
     def __init__(self, data: Any, curve: AccuracyCurve | None) -> None:
@@ -47,7 +53,7 @@ class ShownModes:
         Raises
         ------
         AccuracyError
-            If no number of modes meets the budget; everything then stays as it is.
+            If no number of modes meets the budget; nothing changes then.
         """
         most = self._data.model.n_modes
         if budget is not None:
@@ -59,7 +65,7 @@ class ShownModes:
 
     @property
     def accuracy(self) -> str:
-        """The errors certified for the modes that are shown unless steps are late, in words."""
+        """Return the certified errors of the modes shown while no steps are late, in words."""
         point = self._points.get(self._most)
         text = f"{self._most} modes"
         if point is not None:
@@ -74,7 +80,13 @@ class ShownModes:
 
         The loop reads the new number at its next step.
 
-        watched : a tool touches the organ, or somebody receives what is shown; else all modes are
+        Parameters
+        ----------
+        statistics : LoopStatistics
+            Message of the window, to be completed.
+        watched : bool
+            Whether a tool touches the organ or somebody receives the cloud; if not, all modes are
+            shown.
         """
         before = self._data.n_shown
         self._describe(statistics, before)
@@ -92,7 +104,8 @@ class ShownModes:
 
     def _describe(self, statistics: LoopStatistics, shown: int) -> None:
         measured = [n for n in self._points if n <= shown]
-        point = self._points[max(measured)] if measured else None  # more modes are no less accurate
+        # more modes are at least as accurate
+        point = self._points[max(measured)] if measured else None
         statistics.modes_shown, statistics.modes = shown, self._most
         statistics.promised_l2 = point.l2 if point else _NAN
         statistics.promised_force = point.force if point else _NAN

@@ -20,7 +20,7 @@ class TimingRecord:
         self.begin = begin
         self.n_periods = 0
         self.n_missed = 0
-        self.nominal = 0  # sum of the periods as they should have been
+        self.nominal = 0  # sum of the nominal periods [ns]
         self.n_steps = 0
         self.n_ages = 0
         self.n_models = 0
@@ -30,6 +30,7 @@ class TimingRecord:
         self.models = np.zeros(self.CAPACITY, np.int64)
 
     def note_period(self, period: int, nominal: int) -> None:
+        """Note the time since the last step, and its nominal value [ns]."""
         if self.n_periods < self.CAPACITY:
             self.periods[self.n_periods] = period
             self.n_periods += 1
@@ -38,28 +39,30 @@ class TimingRecord:
 
     @property
     def nominal_rate(self) -> float:
-        """Periods per second as they should have been [Hz]; NaN of none."""
+        """Return the nominal number of periods per second [Hz]; NaN without periods."""
         return 1e9 * self.n_periods / self.nominal if self.nominal else float("nan")
 
     def note_step(self, compute: int) -> None:
+        """Note the time from the step's start until its wrenches were sent [ns]."""
         if self.n_steps < self.CAPACITY:
             self.computes[self.n_steps] = compute
             self.n_steps += 1
 
     def note_model(self, duration: int) -> None:
-        """Time of the computation alone: forces and cloud, without messages."""
+        """Note the time of the computation alone: forces and cloud, without messages [ns]."""
         if self.n_models < self.CAPACITY:
             self.models[self.n_models] = duration
             self.n_models += 1
 
     def note_age(self, age: int) -> None:
+        """Note the age of a pose when it was taken [ns]."""
         if self.n_ages < self.CAPACITY:
             self.ages[self.n_ages] = age
             self.n_ages += 1
 
 
 def statistics(record: TimingRecord, end: int) -> LoopStatistics:
-    """Summary of a record that ended at ``end`` [ns]."""
+    """Summarise a record that ended at ``end`` [ns]."""
     window = (end - record.begin) * 1e-9
     computes = record.computes[: record.n_steps]
     period_p50, period_p99, period_max = _percentiles(record.periods[: record.n_periods])
@@ -86,9 +89,9 @@ def statistics(record: TimingRecord, end: int) -> LoopStatistics:
 
 
 def _percentiles(times: np.ndarray) -> tuple[float, float, float]:
-    """Median, 99th percentile and maximum of times [ns], by nearest rank [s]; NaN of none.
+    """Return median, 99th percentile and maximum of times [ns] in [s]; NaN without times.
 
-    A tenth of the time of ``numpy.percentile``, which would hold the loop up by as much.
+    By nearest rank, in a tenth of the time of ``numpy.percentile``: the loop waits meanwhile.
     """
     n = len(times)
     if n == 0:

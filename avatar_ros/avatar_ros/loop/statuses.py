@@ -1,15 +1,15 @@
-"""What each status of ContactState means to an operator: its cause, and what to do about it."""
+"""Cause and remedy of each status of ContactState, for operators."""
 
 from __future__ import annotations
 
 from avatar_core.contact.status import Status
 
-# Cause and remedy of every status in which a tool's force is missing or doubtful.
+# every status in which a tool's force is missing or doubtful
 EXPLANATIONS: dict[int, tuple[str, str]] = {
     Status.NO_MODEL: ("no vademecum is loaded", "load one"),
     Status.NO_POSE: ("no pose of the tool has arrived yet", "start its driver"),
     Status.STALE_POSE: (
-        "the tool's poses stopped",
+        "the tool's poses have stopped",
         "check its driver, the network and the load of the machine",
     ),
     Status.SLOW_POSES: (
@@ -33,15 +33,15 @@ EXPLANATIONS: dict[int, tuple[str, str]] = {
         "set tool_frame and tool_transform of the contact node, or publish in the organ's frame",
     ),
     Status.EXTRAPOLATED: (
-        "the tool presses deeper or pulls farther than the response is known; the force goes on",
+        "the tool presses or pulls beyond the computed range; the force is extrapolated",
         "press less deeply, or pull less far",
     ),
     Status.SLIPPED: ("the jaw lost the tissue", "open it, and close it again"),
     Status.LEAP: ("the tool's pose jumped", "check its driver, or raise safety.leap"),
     Status.SEVERAL_PUBLISHERS: ("several nodes send poses of the tool", "stop all but one"),
-    Status.LOST_TOOL: ("no node sends poses of the tool any more", "start its driver again"),
+    Status.LOST_TOOL: ("no node sends the tool's poses any longer", "start its driver again"),
     Status.NO_OPERATING_STATE: (
-        "the tool's device has not said in what state it is",
+        "the tool's device has not reported its state",
         "start its driver, remap NAME/operating_state to it, or set tool_operating_state to false",
     ),
     Status.NOT_ENABLED: (
@@ -50,12 +50,12 @@ EXPLANATIONS: dict[int, tuple[str, str]] = {
     ),
     Status.NOT_HOMED: (
         "the tool's device is not homed",
-        "home it at its console, by hand or by NAME/state_command, as its maker says",
+        "home it at its console, by hand or by NAME/state_command, following its manual",
     ),
     Status.INACTIVE: ("the contact node is being stopped", "activate it again"),
 }
 
 
 def explanation(status: int) -> str:
-    """Cause and remedy in one line; empty for a status that needs none."""
+    """Return cause and remedy in one line; empty for a status that needs none."""
     return "; ".join(EXPLANATIONS.get(status, ()))

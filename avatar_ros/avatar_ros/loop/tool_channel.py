@@ -28,33 +28,49 @@ SLOW_POSES = int(Status.SLOW_POSES)
 UNKNOWN_FRAME = int(Status.UNKNOWN_FRAME)
 
 _UNKNOWN = float("nan")  # position of a tool whose last pose was invalid: it may not have moved
-_LEAP_INTERVAL = 2e-3  # between two poses, to which ``leap`` refers [s]
-_SLOW = 0.75  # of the timeout: poses that lie farther apart are slow
-# a stream that was refused is so until the next message, or until none came for this long [ns]
+_LEAP_INTERVAL = 2e-3  # time between two poses, to which ``leap`` refers [s]
+_SLOW = 0.75  # fraction of the timeout: poses farther apart are slow
+# a refused stream stays refused until the next message, or until none came for this long [ns]
 _SILENCE = 2_500_000_000
-_ENDED = (STALE_POSE, LOST_TOOL)  # the stream of poses
+_ENDED = (STALE_POSE, LOST_TOOL)  # statuses after which the next pose starts another stream
 _OF_A_STREAM = (INVALID_POSE, UNKNOWN_FRAME, SEVERAL_PUBLISHERS, SLOW_POSES)
 _NO_INTERVALS = (0, 0, 0)  # [ns]
-_NO_NUMBER = 2**64 - 1  # of middleware that does not count messages
+_NO_NUMBER = 2**64 - 1  # sequence number of middleware that does not count messages
 _N_STATUS = 32
 
 
 class ToolChannel:
     """One tool's subscription, publishers and last pose.
 
-    Poses come in the tool's frame; ``tip`` and ``orientation`` of the step are in the organ's.
+    Poses come in the tool's frame; ``tip`` and ``orientation`` of the step are in the organ's. The
+    node sets ``senders``, ``listeners``, ``band_listeners``, ``device`` and ``operating_state``;
+    the
+    loop sets ``solved``.
 
-    band_publishers : of the low and the high edge of the band of its force; may be none
-    jaw : whether it is closed; None if nobody can say
-    status : OK with a usable pose, otherwise the reason why there is none
-    stamp : of the last valid pose, eight bytes; zero before the first
-    publishers : of its poses, as the node last counted them; one that was killed counts for a while
-    senders : name of the node of each publisher, by its GID, as the node found them; the node's
-    listeners : to its wrenches, likewise; band_listeners : to their bands
-    device : OK if its device takes forces or is not asked, otherwise why it does not; the node's
-    operating_state : what its device said last, in words; empty before, the node's likewise
-    solved : status of the last step for it; the loop's
-    faults : how often each status was entered since the node started, by its number
+    Attributes
+    ----------
+    band_publishers : tuple
+        Publishers of the low and the high edge of its force's band; may be empty.
+    jaw : JawChannel, optional
+        Channel of its jaw; None if the tool has none.
+    status : int
+        OK with a usable pose, otherwise the reason why there is none.
+    stamp : bytes
+        Stamp of the last valid pose, eight bytes; zero before the first.
+    publishers : int
+        Publishers of its poses at the last count; a killed one counts for a while.
+    senders : dict
+        Node name of each publisher of its poses, by GID.
+    listeners, band_listeners : int
+        Subscribers to its wrenches and to their bands.
+    device : int
+        OK if its device takes forces or is not heard, otherwise the reason why not.
+    operating_state : str
+        Last state that its device reported, in words; empty before.
+    solved : int
+        Status of the last step for it.
+    faults : ndarray of int
+        How often each status was entered since the node started, by its number.
     """
 
     def __init__(
@@ -86,40 +102,42 @@ class ToolChannel:
         self._edges = [WrenchTemplate(frame) for _ in band]
         self._reader = PoseReader(frame)
         i, j, k, w = np.array(safety.transform[3:]) / math.hypot(*safety.transform[3:])
-        self._frame = (float(i), float(j), float(k), float(w))  # of the tool in the organ's
+        # orientation of the tool's frame in the organ's
+        self._frame = (float(i), float(j), float(k), float(w))
         self._rotation = _rotation(self._frame)
         self._is_turned = not np.array_equal(self._rotation, np.eye(3))
         self._origin = np.array(safety.transform[:3])
         self._turned = np.zeros(3)
-        self._last = np.full(3, FAR_AWAY)  # valid position, in the tool's frame [m]
-        self._received = 0  # the last valid pose [ns]
-        self._heard = 0  # the last message, valid or not [ns]
+        self._last = np.full(3, FAR_AWAY)  # last valid position, in the tool's frame [m]
+        self._received = 0  # time of the last valid pose [ns]
+        self._heard = 0  # time of the last message, valid or not [ns]
         self._intervals = _NO_INTERVALS  # between the last valid poses of this stream [ns]
-        self._number = -1  # of the last message, as its publisher counts
+        self._number = -1  # sequence number of the last message
         self._renewed = (
             self._mixed
-        ) = -1  # when the numbers last decreased after a stream, in it [ns]
-        self._counted = 0  # when the node last counted publishers [ns]
+        ) = -1  # times when numbers last decreased: after the end of a stream, and within one [ns]
+        self._counted = 0  # time when the node last counted publishers [ns]
         self._sender = ""  # GID of the last publisher that was heard alone
-        self._replaced: set[str] = set()  # publishers whose stream had ended when another's began
-        self._several = False  # publishers, beside those that were replaced
+        self._replaced: set[str] = set()  # publishers whose stream had ended when another began
+        self._several = False  # whether there are several publishers, replaced ones apart
         self._kind = safety.wrench
-        self._axes = (0.0, 0.0, 0.0, 1.0)  # of the last valid pose, as long as the channel exists
+        # orientation of the last valid pose, kept while the channel exists
+        self._axes = (0.0, 0.0, 0.0, 1.0)
 
     @property
     def ports(self) -> tuple[Any, ...]:
-        """Its subscription and publishers."""
+        """Return its subscription and publishers."""
         jaw = () if self.jaw is None else (self.jaw.subscription,)
         return (self.subscription, self.publisher, *self.band_publishers, *jaw)
 
     @property
     def connected(self) -> bool:
-        """Whether somebody sends its poses or takes its wrenches. Real-time safe."""
+        """Return whether somebody sends its poses or takes its wrenches. Real-time safe."""
         return self.publishers > 0 or self.listeners > 0
 
     @property
     def fault(self) -> int:
-        """Why no force is sent, for its poses or else its device; OK if it is. Real-time safe."""
+        """Return why poses or device allow no force; OK if they do. Real-time safe."""
         return self.status if self.status != OK else self.device
 
     def take(
@@ -130,12 +148,18 @@ class ToolChannel:
         orientation: np.ndarray,
         leap: float = math.inf,
     ) -> bool:
-        """Take the newest pose, if any; true if a usable one came. Real-time safe.
+        """Take the newest pose, if any; return true if a usable one came. Real-time safe.
 
-        now, timeout : [ns]
-        tip : receives the position [m]
-        orientation : receives that of the tool, a quaternion x y z w; zero without a usable pose
-        leap : distance in 2 ms, proportionally more in a longer interval, that is a fault [m]
+        Parameters
+        ----------
+        now, timeout : int
+            Present time and time limit of a pose [ns].
+        tip : ndarray, shape (3,)
+            Receives the position [m].
+        orientation : ndarray, shape (4,)
+            Receives the tool's quaternion x y z w; zero without a usable pose.
+        leap : float
+            Distance in 2 ms that is a fault, proportionally more in a longer interval [m].
         """
         taken = self.subscription.handle.take_message(PoseStamped, True)
         status = self._judge(taken, now, timeout, leap)
@@ -153,7 +177,7 @@ class ToolChannel:
         return True
 
     def note_solved(self, status: int) -> None:
-        """Note what the step of the model returned for it. Real-time safe."""
+        """Note the status that the model's step returned for this tool. Real-time safe."""
         if status != self.solved:
             self.faults[status] += 1
             self.solved = status
@@ -161,11 +185,16 @@ class ToolChannel:
     def note_senders(self, senders: dict[str, str], now: int) -> None:
         """Note who sends poses; called by the node, outside the loop.
 
-        The middleware knows a driver that was killed for another 20 s. It does not count if its
-        stream had ended when that of the next one began, unless it sends again.
+        The middleware lists a killed driver for another 20 s. A driver does not count if its stream
+        had
+        ended when the next one began, unless it sends again.
 
-        senders : as the attribute
-        now : before they were asked for [ns]
+        Parameters
+        ----------
+        senders : dict
+            As the attribute.
+        now : int
+            Time before the middleware was asked for them [ns].
         """
         if self._mixed >= self._counted:
             self._replaced = set()
@@ -179,12 +208,14 @@ class ToolChannel:
         self.senders, self.publishers, self._counted = senders, len(senders), now
 
     def answer(self) -> None:
-        """Send ``wrench``, given in the organ's frame, as the tool takes it. Real-time safe."""
+        """Send ``wrench``, given in the organ's frame, in the tool's form. Real-time safe."""
         self._send(self.publisher, self.wrench)
 
     def send_band(self, edges: np.ndarray) -> None:
-        """Send both edges of its band, force and torque (2, 6) in the organ's frame, if anybody
-        hears them. Real-time safe."""
+        """Send both edges of its band, if anybody listens. Real-time safe.
+
+        edges : force and torque, shape (2, 6), in the organ's frame
+        """
         if self.band_listeners == 0:
             return
         for publisher, wrench, edge in zip(self.band_publishers, self._edges, edges, strict=False):
@@ -192,7 +223,7 @@ class ToolChannel:
             self._send(publisher, wrench)
 
     def _send(self, publisher: Any, wrench: WrenchTemplate) -> None:
-        """Send a wrench in the organ's frame as the tool takes it. Real-time safe."""
+        """Send a wrench, given in the organ's frame, in the tool's form. Real-time safe."""
         force, torque = wrench.force, wrench.torque
         if self._is_turned:
             for part in (force, torque):
@@ -210,11 +241,11 @@ class ToolChannel:
         publisher.handle.publish_raw(wrench.serialise(self.stamp))
 
     def _judge(self, taken: Any, now: int, timeout: int, leap: float) -> int:
-        """The status after a message, or after none came. Real-time safe."""
+        """Return the status after a message, or after none came. Real-time safe."""
         if taken is None:
             return self._in_silence(now, timeout)
         self._heard = now
-        self.publishers = max(self.publishers, 1)  # counted anew only once in a while
+        self.publishers = max(self.publishers, 1)  # counted again only once in a while
         status = self._reader.read(taken[0])
         if self._comes_from_several(taken[1], now):
             status = SEVERAL_PUBLISHERS
@@ -227,27 +258,30 @@ class ToolChannel:
         self._last[:] = self._reader.position
         self._received = now
         self.stamp = self._reader.stamp
-        if sorted(self._intervals)[1] > _SLOW * timeout:  # of a stream, not of one pose
+        # median: a property of the stream, not of one pose
+        if sorted(self._intervals)[1] > _SLOW * timeout:
             return SLOW_POSES
-        if late:  # with a good pose before, only if the loop itself was held up
+        if late:  # after a good pose, only if the loop itself was held up
             return STALE_POSE if self.status == OK else OK
         return LEAP if leapt and self.status in (OK, LEAP, INVALID_POSE) else OK
 
     def _in_silence(self, now: int, timeout: int) -> int:
-        """The status of a period without a message. Real-time safe."""
+        """Return the status of a period without a message. Real-time safe."""
         if self.status == NO_POSE or now - self._received <= timeout:
             return self.status
         if not self.publishers or now - self._heard > _SILENCE:
-            self._intervals = _NO_INTERVALS  # what comes next is another stream
+            self._intervals = _NO_INTERVALS  # the next message begins another stream
             return STALE_POSE if self.publishers else LOST_TOOL
         if self.status in _OF_A_STREAM:
             return self.status
-        # silence before the last pose as well as after it: a slow stream, as far as is known
+        # silence both before and after the last pose: a slow stream, as far as is known
         return SLOW_POSES if self._intervals[-1] > timeout else STALE_POSE
 
     def _comes_from_several(self, info: Any, now: int) -> bool:
-        """Whether the node counted several publishers, or the numbers of messages say so before it
-        counts again: of one publisher they increase. Real-time safe."""
+        """Return whether poses come from several publishers. Real-time safe.
+
+        The node counts them; sequence numbers that do not increase show it before the next count.
+        """
         number = info["publication_sequence_number"] if info else None
         if number is not None and number != _NO_NUMBER:
             if number <= self._number and self.status in _ENDED:
@@ -271,11 +305,12 @@ class ToolChannel:
 
 
 def tool_channels(ports: Ports, settings: LoopSettings) -> list[ToolChannel]:
-    """The channels of all tools, whose messages the loop takes itself.
+    """Make the channels of all tools; the loop takes their messages itself.
 
     Raises
     ------
-    ParameterError : an override of the quality of service has a value that is refused
+    ParameterError
+        If an override of the quality of service has a refused value.
     """
     polled = PolledSubscriptions()
     return [_channel(ports, settings, name, polled) for name in settings.tools]
@@ -307,7 +342,7 @@ def _channel(
 
 
 def _rotation(quaternion: tuple[float, ...]) -> np.ndarray:
-    """The matrix of a unit quaternion x, y, z, w."""
+    """Return the rotation matrix of a unit quaternion x, y, z, w."""
     i, j, k, w = quaternion
     return np.array(
         [

@@ -224,6 +224,6 @@ def test_diagnostics_name_a_fault_its_remedy_and_its_end(probe: Any, hand: Hand)
     assert "tool_transform" in fault["/contact: tool"].message
     hand.pose.header.frame_id = "organ"
     sound = diagnostics(probe, hand, lambda n: n["/contact: tool"].level == DiagnosticStatus.OK)
-    assert sound["/contact: tool"].message == "poses sound, force sent whole"
+    assert sound["/contact: tool"].message == "poses valid, full force sent"
     assert sound["/contact: tool"].hardware_id == "/tool"  # as its driver is called
     assert sound["/contact: loop"].hardware_id == socket.gethostname()
