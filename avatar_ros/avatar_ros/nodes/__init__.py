@@ -1,3 +1,4 @@
-"""The nodes that ``ros2 run`` starts, one file each, and the planning cell that starts them
-together. Topics, services and parameters are documented in msg_docs/.
+"""The nodes that ``ros2 run`` starts, one file each, and the planning cell that starts all.
+
+Topics, services and parameters are documented in msg_docs/.
 """

@@ -1,4 +1,4 @@
-"""Calibration for a service: files are read, and all is computed, in a process of its own."""
+"""Calibration for a service: a separate process reads the files and computes."""
 
 from __future__ import annotations
 
@@ -14,13 +14,18 @@ from avatar_ros.srv import CalibrateMaterial
 
 _CALIBRATED = Imported("avatar_core.bags.touched", "calibrated_files")
 _BYTES = 6 << 30  # address space of the process [bytes]
-_SECONDS = 600.0  # of processor time
+_SECONDS = 600.0  # limit of processor time [s]
 
 
 class Calibrator:
-    """Answers one request at a time.
+    """Calibration service that answers one request at a time.
 
-    library_dir, max_bytes : where files are found, and how large they may be
+    Parameters
+    ----------
+    library_dir : str
+        Directory of the files.
+    max_bytes : int
+        Largest size of a file.
     """
 
     def __init__(self, library_dir: str, max_bytes: int) -> None:
@@ -31,14 +36,19 @@ class Calibrator:
     def answered(
         self, request: CalibrateMaterial.Request, loaded: str, response: CalibrateMaterial.Response
     ) -> CalibrateMaterial.Response:
-        """Fill the answer; it takes up to a minute.
+        """Fill the answer; this takes up to a minute.
 
-        loaded : vademecum that is meant where the request names none
+        Parameters
+        ----------
+        request, response : messages of CalibrateMaterial
+            Request, and the response to fill.
+        loaded : str
+            Vademecum to use if the request names none.
 
         Raises
         ------
         AvatarError
-            For a field that is refused, or files that do not give a calibration.
+            If a field is refused, or the files give no calibration.
         """
         if not self._busy.acquire(blocking=False):
             raise RefusedError("another calibration is being computed; ask again after it")
@@ -57,11 +67,11 @@ class Calibrator:
         return response
 
     def stop(self) -> None:
-        """Give up what is being computed, if anything is."""
+        """Stop a computation that is running, if any."""
         self._confined.kill()
 
     def _arguments(self, request: CalibrateMaterial.Request, loaded: str) -> tuple[Any, ...]:
-        """Of ``calibrated_files``."""
+        """Return the arguments of ``calibrated_files``."""
         name = request.name or loaded
         if not name:
             raise RefusedError("no vademecum was loaded; load one, or give name")
@@ -88,7 +98,7 @@ class Calibrator:
 
 
 def _fields(told: dict[str, Any]) -> dict[str, Any]:
-    """Of an answer, from the numbers of a calibration."""
+    """Return the fields of an answer, from the numbers of a calibration."""
     found = [told["values"][name] for name in told["parameters"]]
     return {
         "message": told["verdict"],

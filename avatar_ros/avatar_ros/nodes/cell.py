@@ -1,6 +1,6 @@
 """A planning cell without the launch package: its nodes as processes that end together.
 
-A node that dies is started again, at once and then after ever longer waits. One that refuses to
+A node that dies is started again, at once and then after increasing waits. A node that refuses to
 start, or was told to end, ends the cell.
 
 Run as ``avatar cell``.
@@ -20,25 +20,26 @@ from avatar_ros.framework import realtime
 from avatar_ros.framework.stop_signal import StopSignal
 
 _POLL = 0.1  # [s]
-_STOP_TIMEOUT = 5.0  # for a node to end by itself [s]
-_STARTED = 10.0  # after which an error is none of the start, such as a wrong parameter [s]
-_WELL = 60.0  # after which earlier deaths are forgotten [s]
-_LONGEST_WAIT = 30.0  # before a node is started again [s]
+_STOP_TIMEOUT = 5.0  # time for a node to end by itself [s]
+# time after which an error no longer belongs to the start, such as a wrong parameter [s]
+_STARTED = 10.0
+_WELL = 60.0  # running time after which earlier deaths are forgotten [s]
+_LONGEST_WAIT = 30.0  # longest wait before a node is started again [s]
 
-# Parameters that override those of the file, by node.
+# parameters that override those of the file, by node
 OVERRIDES = {
     "vademecum_loader": ("library_dir", "vademecum", "state_dir"),
     "contact": ("tools", "scene", "state_dir"),
     "patient_interpolation": ("library_dir", "atlas"),
     "planning_ui": ("library_dir", "host", "port"),
 }
-# Nodes that run only if this was given.
+# nodes that run only if this option was given
 REQUIRED = {"patient_interpolation": "atlas", "planning_ui": "ui"}
-LISTS = ("tools",)  # given as words with commas
+LISTS = ("tools",)  # given as words separated by commas
 
 
 def node_arguments(params: Path | None, given: dict[str, str]) -> dict[str, list[str]]:
-    """The arguments of each node that runs, by name; some run only if they are asked for."""
+    """Return the arguments of each node that runs, by name; some run only on request."""
     found = {}
     for node, names in OVERRIDES.items():
         if REQUIRED.get(node, node) not in {node, *given}:
@@ -51,12 +52,12 @@ def node_arguments(params: Path | None, given: dict[str, str]) -> dict[str, list
 
 
 def _value(name: str, given: str) -> str:
-    """As ROS reads it."""
+    """Write a value as ROS reads it."""
     return f"[{given}]" if name in LISTS else given
 
 
 class KeptNode:
-    """A node as a process, which is started again when it dies."""
+    """Process of a node, started again when it dies."""
 
     def __init__(self, name: str, words: list[str]) -> None:
         self.name, self._words = name, words
@@ -72,7 +73,7 @@ class KeptNode:
         )
 
     def tend(self) -> bool:
-        """Start the node again if it died, and say so; False if the cell cannot go on."""
+        """Restart the node if it died, and report that; return False if the cell cannot go on."""
         code, now = self.process.poll(), time.monotonic()
         if code is None:
             return True
@@ -93,12 +94,12 @@ class KeptNode:
 
 
 def wait_after(deaths: int) -> float:
-    """Time before a node is started again that died so often in a row [s]."""
+    """Return the wait before a node is started again after this many deaths in a row [s]."""
     return 0.0 if deaths < 2 else min(2.0 ** (deaths - 2), _LONGEST_WAIT)
 
 
 def run(arguments: dict[str, list[str]]) -> int:
-    """Keep the nodes running until one cannot, or a signal comes; returns the exit code."""
+    """Keep the nodes running until one cannot, or a signal comes; return the exit code."""
     stop = StopSignal()
     nodes = [KeptNode(name, words) for name, words in arguments.items()]
     goes_on = True
@@ -121,6 +122,7 @@ def _say(text: str) -> None:
 
 
 def main() -> int:
+    """Run the cell as the command line asks; return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m avatar_ros.nodes.cell")
     parser.add_argument("--params", type=Path)
     for name in sorted({name for names in OVERRIDES.values() for name in names}):

@@ -63,7 +63,7 @@ from avatar_ros.prepare.supplier import SUPERSEDED, ModelSupplier
 from avatar_ros.srv import LoadScene
 
 _BUDGET = ("accuracy.tolerance", "accuracy.quantity", "accuracy.deadline")
-_GRACE = 0.1  # for which a replaced model is kept after the last step that uses it [s]
+_GRACE = 0.1  # time for which a replaced model is kept after the last step that uses it [s]
 
 
 class ContactNode(ManagedNode):
@@ -77,9 +77,10 @@ class ContactNode(ManagedNode):
         self._outputs: Publishers | None = None
         self._frames: Any = None  # publisher of the static transforms
         self._reports: ContactReports | None = None  # while the node is active
-        self._ranges: dict[str, tuple[float, float]] | None = None  # of the vademecum in use
-        self._held: Held | None = None  # parameters of it, of which distributions may be given
-        self._told: tuple[str, ...] = ()  # of the material that it has no place for
+        # ranges of the material in the vademecum in use
+        self._ranges: dict[str, tuple[float, float]] | None = None
+        self._held: Held | None = None  # its parameters that may have distributions
+        self._told: tuple[str, ...] = ()  # notices on values of the material that it does not hold
         self._n_awaited = 0
         self._changing = threading.RLock()
         super().__init__("contact", CONTACT)
@@ -94,13 +95,16 @@ class ContactNode(ManagedNode):
 
     @property
     def failure(self) -> str:
+        """Return why the loop ended; empty while it runs."""
         return "" if self._loop is None else self._loop.failure
 
     @property
     def has_pending_answers(self) -> bool:
+        """Return whether scenes are still being loaded."""
         return self._n_awaited > 0
 
     def configure(self) -> None:
+        """Make the loop, its topics and the supplier of models."""
         settings = self._settings()
         if settings.scene:
             self._set_cloud_divisor(settings.cloud_divisor)
@@ -136,7 +140,7 @@ class ContactNode(ManagedNode):
         self._save_state()
 
     def _settings(self) -> LoopSettings:
-        """From the parameters and the saved scene, which is dropped if it does not fit any more."""
+        """Read parameters and saved scene; drop the scene if it no longer fits."""
         try:
             return read_contact(self, self._scene)
         except ParameterError as error:
@@ -147,6 +151,7 @@ class ContactNode(ManagedNode):
             return read_contact(self)
 
     def activate(self) -> None:
+        """Start the loop, the reports and the commands to devices."""
         assert self._loop is not None and self._outputs is not None
         settings = self._loop.settings
         stamp = self.get_clock().now().to_msg()
@@ -170,6 +175,7 @@ class ContactNode(ManagedNode):
         )
 
     def deactivate(self) -> None:
+        """Stop the reports and the loop."""
         if self._reports is not None:
             self._reports.stop()
             self._reports = None
@@ -177,6 +183,7 @@ class ContactNode(ManagedNode):
             self._loop.stop()
 
     def clean_up(self) -> None:
+        """Stop the supplier and remove all topics."""
         if self._supplier is not None:
             self._supplier.stop()
             self._supplier = None
@@ -227,7 +234,7 @@ class ContactNode(ManagedNode):
         del replaced  # frees its memory here, not in the loop
 
     def _tell(self, notices: tuple[str, ...]) -> None:
-        """Say once which values of the material the vademecum in use has no place for."""
+        """Report once which values of the material do not apply to the vademecum in use."""
         for notice in notices:
             if notice not in self._told:
                 self.get_logger().warning(f"{notice}; it stays as built")
@@ -245,7 +252,8 @@ class ContactNode(ManagedNode):
             self._save_state()
             response.message = f"in use after {time.monotonic() - begin:.2f} s"
             response.success = True
-        except Exception as error:  # a service always answers; the text decides what is raised
+        # a service always answers; the text decides which error is raised
+        except Exception as error:
             response.message = one_line(error)
             self.get_logger().error(f"load_scene: {response.message}")
         if self._loop is not None:
@@ -253,11 +261,11 @@ class ContactNode(ManagedNode):
         return response
 
     def _restore(self, kept: dict[str, Any]) -> str:
-        """Set the saved parameters; returns the saved scene, or an empty string."""
+        """Set the saved parameters; return the saved scene, or an empty string."""
         scene = str(kept.pop("scene", ""))
         try:
             chosen_known(str(kept.get("uncertainty", "")))
-        except ParameterError as error:  # its file may be gone
+        except ParameterError as error:  # the file may be missing
             self.get_logger().error(f"a saved value is not used: {error}")
             del kept["uncertainty"]
         for result in self.set_parameters([Parameter(n, value=v) for n, v in kept.items()]):
@@ -269,7 +277,7 @@ class ContactNode(ManagedNode):
         return scene
 
     def _save_state(self) -> None:
-        """Save what is in force for the next start."""
+        """Save the values in use for the next start."""
         with self._changing:
             if self._supplier is None:
                 return
@@ -278,7 +286,7 @@ class ContactNode(ManagedNode):
             self._state.save(now)
 
     def _set_cloud_divisor(self, divisor: int) -> None:
-        """Set the divisor of a scene as the parameter, which may change later."""
+        """Set a scene's divisor as the parameter, which may change later."""
         self.set_parameters([Parameter("cloud_divisor", value=divisor)])
 
     async def _in_use(self, change: Change) -> PreparedModel:
@@ -286,10 +294,11 @@ class ContactNode(ManagedNode):
 
         Raises
         ------
-        SceneError : it was refused
+        SceneError
+            If the change was refused.
         """
         executor, supplier = self.executor, self._supplier
-        assert executor is not None  # which runs this
+        assert executor is not None  # the executor runs this callback
         if supplier is None or self._reports is None:
             raise SceneError("the node is inactive; activate it first")
         done = Future(executor=executor)
@@ -326,7 +335,7 @@ class ContactNode(ManagedNode):
             safety = chosen_safety(self._values(tuple(p.name for p in SAFETY), changes))
             known = settings.known
             for change in changes:
-                if change.name == "uncertainty":  # its file may say something else by now
+                if change.name == "uncertainty":  # the file may have changed
                     known = chosen_known(change.value)
         except (AccuracyError, ParameterError) as error:
             return SetParametersResult(successful=False, reason=str(error))
@@ -360,7 +369,7 @@ class ContactNode(ManagedNode):
         return SetParametersResult(successful=True)
 
     def _values(self, names: tuple[str, ...], changes: list[Parameter]) -> dict[str, Any]:
-        """Values of some parameters after changes."""
+        """Return values of some parameters after changes."""
         value = {name: self.get_parameter(name).value for name in names}
         return value | {p.name: p.value for p in changes if p.name in value}
 
@@ -375,8 +384,10 @@ class ContactNode(ManagedNode):
     def _refusal_of_known(
         self, known: dict[str, Distribution], before: dict[str, Distribution]
     ) -> str:
-        """Why the vademecum in use has no place for distributions; empty if it has, or if they are
-        those of before: these may be of another organ's."""
+        """Return why the vademecum in use cannot use distributions; empty if it can.
+
+        Unchanged distributions are not checked: they may belong to another organ.
+        """
         if self._held is None or known == before:
             return ""
         try:
@@ -386,10 +397,11 @@ class ContactNode(ManagedNode):
         return ""
 
     def _refusal_of(self, name: str, value: float, material: dict[str, float]) -> str:
-        """Why a value of the material lies outside the vademecum in use; empty if it does not.
+        """Return why the vademecum in use does not hold a value of the material; else empty.
 
-        On supports, the ranges of stiffness and Young's modulus depend on each other: where both
-        are changed, the worker process decides.
+        With supports, the ranges of stiffness and Young's modulus depend on each other. Where both
+        are
+        changed, the worker process decides.
         """
         if value == 0.0 or self._ranges is None or (name == "young" and name not in self._ranges):
             return ""
@@ -407,6 +419,7 @@ class ContactNode(ManagedNode):
 
 
 def main() -> int:
+    """Run the contact node; return the exit code."""
     return run(ContactNode, keeps_time=True)
 
 

@@ -1,4 +1,4 @@
-"""The frames of the cell for tf2: where the organ lies, and where the tools' frame lies in it."""
+"""Frames of the cell for tf2: the organ in its parent, and the tools' frame in the organ's."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from tf2_msgs.msg import TFMessage
 
 from avatar_ros.loop.settings import LoopSettings
 
-TOPIC = "/tf_static"  # whatever the namespace of the node, as tf2 has it
+TOPIC = "/tf_static"  # outside the node's namespace, as tf2 requires
 
 
 def static_transforms(settings: LoopSettings, stamp: Time) -> TFMessage:
-    """Organ in ``parent_frame``, tools' frame in the organ's; each only if it is another frame."""
+    """Return the organ in ``parent_frame`` and the tools' frame in the organ's, if they differ."""
     organ, tools, parent = settings.frame_id, settings.safety.frame, settings.parent_frame
     found = []
     if parent not in ("", organ, tools):
@@ -25,7 +25,7 @@ def static_transforms(settings: LoopSettings, stamp: Time) -> TFMessage:
 
 
 def _transform(parent: str, child: str, pose: tuple[float, ...], stamp: Time) -> TransformStamped:
-    """``pose`` is that of the child in the parent, x y z [m] and quaternion x y z w."""
+    """Return a transform; ``pose``: child in parent, x y z [m] and quaternion x y z w."""
     made = TransformStamped(child_frame_id=child)
     made.header.frame_id, made.header.stamp = parent, stamp
     to, turn = made.transform.translation, made.transform.rotation

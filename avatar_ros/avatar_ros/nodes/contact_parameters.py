@@ -1,4 +1,4 @@
-"""Reads the contact node's parameters and checks them against one another and the scene."""
+"""Reader of the contact node's parameters, checked against one another and the scene."""
 
 from __future__ import annotations
 
@@ -30,13 +30,19 @@ CLOUDS = get_args(Cloud)
 
 
 def read_contact(node: Node, saved_scene: str = "") -> LoopSettings:
-    """The contact node's parameters, checked against one another.
+    """Read the contact node's parameters, checked against one another.
 
-    saved_scene : YAML, which overrides the parameter ``scene``
+    Parameters
+    ----------
+    node : Node
+        Node with the declared parameters.
+    saved_scene : str
+        YAML that overrides the parameter ``scene``.
 
     Raises
     ------
-    ParameterError : naming the parameter and what it takes
+    ParameterError
+        If a value is not accepted; names the parameter and the accepted values.
     """
     value = values(node, CONTACT)
     tools = tuple(value["tools"])
@@ -75,14 +81,14 @@ def read_contact(node: Node, saved_scene: str = "") -> LoopSettings:
     )
     if saved_scene:
         kept = _with_scene(settings, lambda: parse_scene(saved_scene, "kept"))
-        return replace(kept, cloud_divisor=settings.cloud_divisor)  # may have changed since
+        return replace(kept, cloud_divisor=settings.cloud_divisor)  # it may have changed since
     if value["scene"]:
         return _with_scene(settings, lambda: read_scene(scenes.scene_file(value["scene"])))
     return settings
 
 
 def _with_scene(settings: LoopSettings, read: Callable[[], Scene]) -> LoopSettings:
-    """The settings with the tips and outputs of a scene."""
+    """Return the settings with the tips and outputs of a scene."""
     try:
         scene = read()
         scenes.require_tools(scene, len(settings.tools))

@@ -1,7 +1,7 @@
-"""What the contact node reports once a second: statistics, diagnostics, and lines in the log.
+"""Reports of the contact node once a second: statistics, diagnostics, and lines in the log.
 
-The loop waits for Python's global lock while a report is made. Between the parts of a report the
-lock is left to the loop, so that none of its periods waits for two of them.
+The loop waits for Python's global lock while a report is made. Between two parts of a report the
+lock is left to the loop, so that none of its periods waits for both.
 """
 
 from __future__ import annotations
@@ -25,17 +25,22 @@ from avatar_ros.loop.tool_channel import ToolChannel
 from avatar_ros.msg import LoopStatistics
 
 REPORT_PERIOD = 1.0  # [s]
-_COUNT_PERIOD = 0.1  # between two counts of who is connected; with each report, if nobody was [s]
+# time between counts of publishers and subscribers [s]; without any, each report counts
+_COUNT_PERIOD = 0.1
 _MINUTE = 60.0  # [s]
-_PAUSE = 0.005  # between two parts of a report [s]
-_COLLECTED = 10  # reports between two collections of garbage
+_PAUSE = 0.005  # pause between two parts of a report [s]
+_COLLECTED = 10  # reports from one garbage collection to the next
 
 
 class ContactReports:
     """Summarises the loop's last window, chooses the modes of the next, and publishes both.
 
-    devices : of the tools, whose operating states are heard; none if they are not asked
-    ports : of the node, whose mismatches are reported
+    Parameters
+    ----------
+    devices : sequence of ToolDevice
+        Devices whose operating states are read; empty if not asked.
+    ports : Ports
+        Ports of the node, whose mismatches are reported.
     """
 
     def __init__(
@@ -50,12 +55,13 @@ class ContactReports:
         self._node, self._loop, self._tools = node, loop, tools
         self._devices, self._publishers, self._ports = devices, publishers, ports
         self._faults = diagnostics.FaultCounter(tools)
-        self._owned = [node.resolve_topic_name("vademecum")]  # topics that one cell publishes
+        # topics that only one cell may publish
+        self._owned = [node.resolve_topic_name("vademecum")]
         self._owned += [tool.publisher.topic_name for tool in tools]
-        self._logged: dict[str, str] = {}  # last fault, by tool
+        self._logged: dict[str, str] = {}  # last logged fault, by tool
         self._logged_rivals: list[str] = []
         self._shown_modes_log = ShownModesLog(node)
-        self._timers: list[Timer] = []  # of the reports, and of the counts between them
+        self._timers: list[Timer] = []  # timers of the reports, and of the counts between them
         self._n_reports = 0
 
     def start(self) -> None:
@@ -83,7 +89,7 @@ class ContactReports:
             self._timers[1].cancel()
 
     def _is_alone(self) -> bool:
-        """Whether there is no vademecum, and nobody whose coming or going would matter."""
+        """Return whether there is no vademecum and no tool or device to watch."""
         connected = self._devices or any(tool.connected for tool in self._tools)
         return self._loop.active.data is None and not connected
 
@@ -101,10 +107,10 @@ class ContactReports:
         self._n_reports += 1
         if self._n_reports % _COLLECTED == 0:
             time.sleep(_PAUSE)
-            gc.collect()  # the loop's process does it nowhere else
+            gc.collect()  # the loop's process collects nowhere else
 
     def _is_watched(self) -> bool:
-        """Whether a tool touches the organ, or somebody receives the cloud."""
+        """Return whether a tool touches the organ, or somebody receives the cloud."""
         data = self._loop.active.data
         touched = data is not None and data.out.n_contacts[0] > 0
         return touched or self._publishers.deformation.get_subscription_count() > 0
@@ -142,7 +148,7 @@ class ContactReports:
         self._publishers.diagnostics.publish(message)
 
     def _log_rivals(self, lines: list[str]) -> None:
-        """Log other cells when they come or change."""
+        """Log other cells when they appear or change."""
         for line in (line for line in lines if line not in self._logged_rivals):
             self._node.get_logger().error(f"{line}: {ONE_CELL}")
         self._logged_rivals = lines
@@ -157,7 +163,7 @@ class ContactReports:
                 self._node.get_logger().info(f"{tool}: the fault is over")
 
     def count_ends(self) -> None:
-        """Note who sends each tool's poses and takes its wrenches, and which devices are there."""
+        """Count publishers and subscribers of each tool, and check which devices are there."""
         for tool in self._tools:
             was_connected = tool.connected
             now = time.monotonic_ns()
@@ -170,20 +176,23 @@ class ContactReports:
             device.attend()
 
     def _senders(self, tool: ToolChannel) -> dict[str, str]:
-        """As :meth:`ToolChannel.note_senders` takes them; looked up only where it matters, because
-        the loop waits for that."""
+        """Return the publishers of a tool's poses, for :meth:`ToolChannel.note_senders`.
+
+        They are looked up only if their number changed or matters, because the loop waits
+        meanwhile.
+        """
         topic = tool.subscription.topic_name
         n, known = self._node.count_publishers(topic), tool.senders
         return known if n == len(known) <= 1 else publishers(self._node, topic)
 
 
 class ShownModesLog:
-    """Logs that modes are left out, once a minute at most, and that all of them are back."""
+    """Log of left-out modes, once a minute at most, and of their return."""
 
     def __init__(self, node: Node, clock: Callable[[], float] = time.monotonic) -> None:
         self._node, self._clock = node, clock
-        self._warned = -_MINUTE  # when
-        self._left_out = False  # as the log has it
+        self._warned = -_MINUTE  # time of the last warning [s]
+        self._left_out = False  # state according to the log
 
     def note(self, report: ShownModesReport) -> None:
         """Log the report of a window if it is news."""
@@ -191,5 +200,6 @@ class ShownModesLog:
             self._warned, self._left_out = self._clock(), True
             self._node.get_logger().warning(report.text)
         elif self._left_out and not report.shedding:
-            self._left_out = False  # on a line of its own: rclpy takes one severity a line of code
+            # on a line of its own: rclpy takes one severity for each line of code
+            self._left_out = False
             self._node.get_logger().info(report.text)

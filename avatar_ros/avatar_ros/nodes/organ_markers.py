@@ -48,6 +48,7 @@ class MarkersNode(ManagedNode):
         super().__init__("organ_markers", ORGAN_MARKERS)
 
     def configure(self) -> None:
+        """Make the publishers and subscribe the announcements."""
         self._own_publishers = [
             self.create_publisher(Marker, "organ_rest", qos.LATCHED),
             self.create_publisher(Marker, "organ_deformed", qos.COMMAND),
@@ -58,15 +59,18 @@ class MarkersNode(ManagedNode):
         ]
 
     def activate(self) -> None:
+        """Start to publish at the display rate."""
         rate = self.get_parameter("rate").value
         self._timer = self.create_timer(1.0 / rate, self._show)
 
     def deactivate(self) -> None:
+        """Stop publishing."""
         if self._timer is not None:
             self.destroy_timer(self._timer)
             self._timer = None
 
     def clean_up(self) -> None:
+        """Remove all topics."""
         for announced in self._announced:
             announced.close()
         for publisher in self._own_publishers:
@@ -88,7 +92,7 @@ class MarkersNode(ManagedNode):
         self._lay_out()
 
     def _lay_out(self) -> None:
-        """Once both messages have arrived, in either order; the surface itself has no frame."""
+        """Lay out the markers once surface and frame have arrived, in either order."""
         if not self._frame or self._surface is None:
             return
         self._forget()
@@ -117,6 +121,7 @@ class MarkersNode(ManagedNode):
 
 
 def main() -> int:
+    """Run the node; return the exit code."""
     return run(MarkersNode)
 
 

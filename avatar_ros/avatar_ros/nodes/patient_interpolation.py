@@ -1,4 +1,4 @@
-"""Makes a new patient's vademecum from an atlas and puts it into the library of the loader."""
+"""Node that makes a new patient's vademecum from an atlas, in the library of the loader."""
 
 from __future__ import annotations
 
@@ -42,11 +42,12 @@ _DEFAULT_FIDELITY = "interpolated"
 
 
 def patient_request(request: Any, settings: InterpolationSettings) -> PatientRequest:
-    """The checked request of a service call or a goal; the atlas is not needed for it.
+    """Check the request of a service call or a goal; the atlas is not needed for that.
 
     Raises
     ------
-    RefusedError : naming the field and what it takes
+    RefusedError
+        If a field is not accepted; names the field and the accepted values.
     """
     mesh = request.mesh
     inline = bool(len(mesh.vertices) or len(mesh.triangles))
@@ -143,6 +144,7 @@ class PatientInterpolationNode(ManagedNode):
         )
 
     def configure(self) -> None:
+        """Check the folders and start the builder."""
         settings = read_interpolation(self)
         if not os.path.isdir(settings.library_dir):
             raise ParameterError(f"parameter library_dir: {settings.library_dir} is no directory")
@@ -155,20 +157,24 @@ class PatientInterpolationNode(ManagedNode):
         self.get_logger().info(f"{settings.build.atlas}: {self._builder.n_anatomies} anatomies")
 
     def activate(self) -> None:
+        """Accept requests."""
         self._active = True
 
     def deactivate(self) -> None:
+        """Refuse requests, and cancel the build that runs."""
         self._active = False
         if self._builder is not None:
             self._builder.cancel()
 
     def clean_up(self) -> None:
+        """Stop the builder."""
         if self._builder is not None:
             self._builder.stop()
             self._builder = None
 
     @property
     def has_pending_answers(self) -> bool:
+        """Return whether an answer is still to be sent."""
         return self._beside.n_awaited > 0
 
     def build(
@@ -177,11 +183,12 @@ class PatientInterpolationNode(ManagedNode):
         on_stage: Callable[[Stage], None] = lambda stage: None,
         cancelled: Callable[[], bool] = lambda: False,
     ) -> Built | Previewed:
-        """Build what a request or a goal asks for.
+        """Build the patient of a request or a goal.
 
         Raises
         ------
-        AvatarError, OSError : no file was written
+        AvatarError, OSError
+            If no file was written.
         """
         if self._settings is None or self._builder is None or not self._active:
             raise RefusedError("the node is inactive; activate it first")
@@ -201,7 +208,8 @@ class PatientInterpolationNode(ManagedNode):
     ) -> InterpolatePatient.Response:
         try:
             _fill(response, await self._beside.done(lambda: self.build(request)))
-        except Exception as error:  # a service always answers; the surface decides what is raised
+        # a service always answers; the surface decides which error is raised
+        except Exception as error:
             self._refuse("interpolate_patient", response, error)
         return response
 
@@ -253,6 +261,7 @@ def _fill(answer: Any, built: Built | Previewed) -> None:
 
 
 def main() -> int:
+    """Run the node; return the exit code."""
     return run(PatientInterpolationNode)
 
 

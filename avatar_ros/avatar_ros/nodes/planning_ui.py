@@ -1,8 +1,8 @@
-"""The planning page: an organ in the browser that is pressed with the mouse, simulated at 1 kHz.
+"""The planning page: press an organ in the browser with the mouse, simulated at 1 kHz.
 
-Needs the extra ``ui``. viser serves the page. A process of its own
-(:mod:`avatar_ros.ui.tools.tool_driver`) sends the poses of all tools and reads the answers.
-Clouds are shown 30 times a second. Neither the page nor its users can delay the contact loop.
+Needs the extra ``ui``, whose viser serves the page. :mod:`avatar_ros.ui.tools.tool_driver`, another
+process, sends all tools' poses and reads the answers. Clouds are shown 30 times a second. Neither
+the page nor its users can delay the contact loop.
 """
 
 from __future__ import annotations
@@ -60,11 +60,11 @@ from avatar_ros.ui.view.organ import Organ
 from avatar_ros.ui.view.view import GLASS, WHOLE, OrganView
 
 FRAME = "organ"
-_PLOT_FRAMES = 6  # between two points of the plots, and two sets of measures
-_CUT_FRAMES = 3  # between two places of a cut that is dragged
-_POLL_FRAMES = 30  # between two checks of library and nodes
+_PLOT_FRAMES = 6  # frames between two points of the plots, and between two sets of measures
+_CUT_FRAMES = 3  # frames between two redraws of a cut that is dragged
+_POLL_FRAMES = 30  # frames between two checks of library and nodes
 _TIP = tuple(parameter.name for parameter in TIP)
-_FOLLOWED = (*MATERIAL, "uncertainty")  # parameters of the contact node, once a second
+_FOLLOWED = (*MATERIAL, "uncertainty")  # parameters of the contact node that are read once a second
 _OF_CONTACT = (*_TIP, *_FOLLOWED, "rate", "tools", "frame_id", "scene", "cloud", "cloud_divisor")
 
 
@@ -76,16 +76,16 @@ class PlanningNode(ManagedNode):
         self._state = SharedToolState.make()
         self._driver = ToolDriverProcess(self._state)
         self._recorder = Recorder(self._state)
-        self._lines: list[str] = []  # numbers that are shown
+        self._lines: list[str] = []  # shown numbers
         self._measured: list[str] = []
         self._alerts: list[str] = []
-        self._reader = Reader(1 << 30)  # of organs, for which the page waits
-        self._files = Reader(1 << 30)  # of what users choose, in threads of their own
+        self._reader = Reader(1 << 30)  # reads organs, for which the page waits
+        self._files = Reader(1 << 30)  # reads files that users choose, in separate threads
         self._live = Live(self, self._state, self._recorder)
         self._band = NewestBand(self, self._state.force_of)
         self._was_missing, self._is_to_restore = True, False
         self._frame, self._frame_id = 0, FRAME
-        self._missed = 0.0  # part of the periods
+        self._missed = 0.0  # fraction of the periods
         self._announced: list[Announced] = []
         self._statistics: Any = None
         self._timer: Any = None
@@ -94,6 +94,7 @@ class PlanningNode(ManagedNode):
     # --- Transitions -------------------------------------------------------------------------
 
     def configure(self) -> None:
+        """Start the page with its parts, and subscribe the cell's topics."""
         value = values(self, PLANNING_UI)
         folder = Path(value["library_dir"]).expanduser()
         if not folder.is_dir():
@@ -199,9 +200,11 @@ class PlanningNode(ManagedNode):
         self.get_logger().info(f"planning page at {guard.address(server.get_port())}")
 
     def activate(self) -> None:
+        """Start to update the page."""
         self._timer = self.create_timer(1.0 / RATE, self._show)
 
     def deactivate(self) -> None:
+        """Stop updating the page, recording and moving tools."""
         if self._timer is not None:
             self.destroy_timer(self._timer)
             self._timer = None
@@ -209,6 +212,7 @@ class PlanningNode(ManagedNode):
         self._driver.end()
 
     def clean_up(self) -> None:
+        """Remove all topics and stop the page."""
         if self._statistics is not None:
             self.destroy_subscription(self._statistics)
         for announced in self._announced:
@@ -225,7 +229,7 @@ class PlanningNode(ManagedNode):
 
     @property
     def _organ(self) -> Organ | None:
-        """That is shown."""
+        """Return the organ that is shown."""
         return self._chosen.organ
 
     # --- From the cell -----------------------------------------------------------------------
@@ -233,7 +237,7 @@ class PlanningNode(ManagedNode):
     def _take_frame(self, info: VademecumInfo) -> None:
         if info.header.frame_id != self._frame_id:
             self._frame_id = info.header.frame_id
-            self._driver.end()  # started again with the new one
+            self._driver.end()  # restarts with the new frame
             self._listen_to_clouds()
 
     def _listen_to_clouds(self) -> None:
@@ -274,7 +278,7 @@ class PlanningNode(ManagedNode):
         self._missed = window.missed / max(window.periods, 1)
 
     def _show(self) -> None:
-        """Update the page; called for every frame, whose messages come together."""
+        """Update the page; called for every frame, whose messages are sent together."""
         if self._server is not None:
             with self._server.atomic():
                 self._show_frame()
@@ -291,7 +295,7 @@ class PlanningNode(ManagedNode):
             self._chosen.settle()
             self._scan.follow(organ, self._view.points)
         if self._recorder.is_full:
-            self._recordings.stop("no more is kept of one recording")
+            self._recordings.stop("a recording holds no more")
         self._band.take()
         played = self._player.state(organ)
         if played is not None:
@@ -303,7 +307,7 @@ class PlanningNode(ManagedNode):
         self._show_numbers(organ, shown, self._chosen.values(organ), self._chosen.given)
 
     def _follow_choice(self) -> None:
-        """Show which tool is chosen, and listen to the band of its force."""
+        """Show which tool is chosen, and subscribe the band of its force."""
         tools = self._chosen.tools
         tools.advance()
         self._band.follow(tools.chosen, tools.name)
@@ -331,12 +335,7 @@ class PlanningNode(ManagedNode):
         material: dict[str, float],
         given: dict[str, float],
     ) -> None:
-        """Beside the picture, of the same period.
-
-        material : in force then, by coordinate [SI]; given : what somebody chose of it
-
-        Numbers are those of the chosen tool, alerts those of all.
-        """
+        """Show the chosen tool's numbers, for a material by coordinate [SI], and all alerts."""
         tools, is_live = self._chosen.tools, not self._player.is_on
         mine = shown[tools.chosen]
         if is_live and not mine.missing:
@@ -357,14 +356,14 @@ class PlanningNode(ManagedNode):
         self._lines = [*map(plain, numbers), *self._measured]
 
     def _measure(self, mine: ShownPeriod, material: dict[str, float]) -> list[str]:
-        """Draw what is measured around the chosen tool, and say it in lines."""
+        """Draw the measures around the chosen tool, and list them in lines."""
         self._measures.change_tip(self._chosen.tip)
         measured = self._measures.lines(Now(self._view.points, mine.tip, material["young"]))
         self._panels.measure.show(measured)
         return measured
 
     def _poll_cell(self) -> None:
-        """Check which nodes run, what the library holds, and that the tool driver runs."""
+        """Check which nodes run, the files of the library, and that the tool driver runs."""
         missing, statuses = self._requests.missing, self._live.statuses
         tools, has_organ = self._chosen.tools, self._organ is not None
         self._panels.show_cell(warnings(missing, has_organ, statuses, tools.labels, self._missed))
@@ -383,11 +382,11 @@ class PlanningNode(ManagedNode):
         elif self._is_to_restore and statuses and ContactState.STATUS_NO_MODEL not in statuses:
             self._is_to_restore = False
             self._chosen.send_again()
-        else:  # others set these too, as `avatar calibrate --set`
+        else:  # other programs set these too, e.g. `avatar calibrate --set`
             self._requests.parameters_of_contact(_FOLLOWED, self._chosen.follow_contact)
 
     def _on_contact_started(self, values: dict[str, Any]) -> None:
-        """The contact node runs, for the first time or again."""
+        """Take over the parameters of a contact node that was started or restarted."""
         self._requests.contact_started()
         self._chosen.contact, self._is_to_restore = values, True
         self._use_tools(self._chosen.moved)
@@ -395,8 +394,7 @@ class PlanningNode(ManagedNode):
         self._panels.organ.show_material(self._chosen.in_force)
 
     def _use_tools(self, names: tuple[str, ...]) -> None:
-        """Those of the contact node that are moved here; of another number, they begin at places
-        of their own."""
+        """Move these tools of the contact node; if their number changes, from starting places."""
         tools, organ = self._chosen.tools, self._organ
         if not names:
             self._say(f"the contact node has no tool '{self._chosen.only}': set the page's `tool`")
@@ -405,7 +403,7 @@ class PlanningNode(ManagedNode):
             self._driver.end()
             targets = tools.targets
             if len(names) != len(targets):
-                self._chosen.scene = ""  # was of another number of tools
+                self._chosen.scene = ""  # it had another number of tools
                 self._player.close()
                 self._live.forget()
                 tips = self._chosen.tips
@@ -416,7 +414,7 @@ class PlanningNode(ManagedNode):
         self._drive()
 
     def _drive(self) -> None:
-        """Send the tools' poses, once it is known which there are, and over what."""
+        """Start the driver of the tools' poses, once tools and organ are known."""
         names = self._chosen.tools.names
         if self._organ is not None and names:
             every = self._chosen.contact["tools"]
@@ -429,7 +427,7 @@ class PlanningNode(ManagedNode):
             self._panels.say(text)
 
     def _click(self, event: Any) -> None:
-        """A click on the organ: put the tool there, or measure; on a preview: paint."""
+        """Handle a click: put the tool on the organ, or measure; on a preview, paint."""
         ray, view = (np.array(event.ray_origin), np.array(event.ray_direction)), self._view
         if self._new_patient.is_previewing:
             self._new_patient.paint(*ray)
@@ -442,18 +440,18 @@ class PlanningNode(ManagedNode):
         self._measures.drag(dot, origin, direction, self._view.points, self._view.faces)
 
     def _in_executor(self, do: Callable[[], None]) -> None:
-        """Draw in the thread that draws the organ: controls call from several."""
-        assert self.executor is not None  # which runs this node
+        """Run in the thread that draws the organ: controls call from several threads."""
+        assert self.executor is not None  # the executor runs this node
         self.executor.create_task(do)
 
     def _offer_files(self) -> None:
         try:
             self._panels.offer(self._library.offer())
-        except OSError as error:  # as of a share that is not mounted any more
+        except OSError as error:  # e.g. a network folder that is no longer mounted
             self._say(f"the library cannot be read: {error.strerror}")
 
     def _choose_built(self, file: str) -> None:
-        """A patient was built: it can be loaded, but the organ in use stays."""
+        """Offer a patient that was built; the organ in use stays."""
         self._offer_files()
         self._panels.organ.choose_file(file)
 
@@ -482,15 +480,16 @@ class PlanningNode(ManagedNode):
         )
 
     def _not_now(self) -> str:
-        """Why what is shown is no state of now; empty if it is."""
+        """Return why the picture is not the present state; empty if it is."""
         if self._player.is_on:
-            return "a recording is shown: go back to now, and keep that"
+            return "a recording is shown: go back to now, and keep the present state"
         if self._new_patient.is_previewing:
             return "a preview is shown, not the organ in use: end the preview first"
         return ""
 
 
 def main() -> int:
+    """Run the node; return the exit code."""
     free_at_once()  # recordings and images come and go
     return run(PlanningNode)
 

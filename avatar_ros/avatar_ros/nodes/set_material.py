@@ -1,4 +1,4 @@
-"""Sets values of the material in the contact node that runs, all or none of them.
+"""Sets values of the material in the running contact node, all or none of them.
 
 Command for ``avatar calibrate --set``: ``python -m avatar_ros.nodes.set_material young=5300
 support.bare_area=2e6``.
@@ -16,12 +16,12 @@ from rclpy.parameter_client import AsyncParameterClient
 
 from avatar_ros.loop.settings import MATERIAL
 
-_FOUND_WITHIN = 10.0  # [s]
-_ANSWERED_WITHIN = 60.0  # a material is prepared before it is accepted [s]
+_FOUND_WITHIN = 10.0  # time to find the contact node [s]
+_ANSWERED_WITHIN = 60.0  # time for its answer: a material is prepared before it is accepted [s]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit code 1 and a line if there is no contact node, or it refuses."""
+    """Set the given values; return 1 after an error line if no contact node accepts them."""
     given = sys.argv[1:] if arguments is None else arguments
     values = dict(word.split("=", 1) for word in given)
     rclpy.init()
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _set(node: Node, values: dict[str, float]) -> str:
-    """Set values by coordinate; why not, or "" if they are in use."""
+    """Set values by coordinate; return why not, or "" if they are in use."""
     names = {coordinate: name for name, coordinate in MATERIAL.items()}
     client = AsyncParameterClient(node, "contact")
     if not client.wait_for_services(_FOUND_WITHIN):

@@ -1,4 +1,4 @@
-"""3D Slicer beside the cell: the organ at rest and deformed, the tool, and patients to build.
+"""3D Slicer next to the cell: the organ at rest and deformed, the tool, and patients to build.
 
 Needs the extra ``slicer``. Slicer's module OpenIGTLinkIF connects to it as a client.
 """
@@ -31,25 +31,26 @@ try:
 except ImportError as error:
     raise SystemExit("slicer_bridge: pyigtl is missing; pip install '.[slicer]'") from error
 
-_DRIVE_PERIOD = 5e-3  # of the tool's poses while a program moves it [s]
+_DRIVE_PERIOD = 5e-3  # period of the tool's poses while a program moves it [s]
 _FIDELITIES = ("interpolated", "reduced", "solved")
 
 SLICER_BRIDGE = (
     AUTOSTART,
     Parameter("host", "127.0.0.1", "address to listen on; 0.0.0.0: all, without any protection"),
     Parameter("port", 18944, "port to listen on, Slicer's default", range=(1, 65535)),
-    Parameter("rate", 10.0, "largest rate of what is sent [Hz]", range=(0.1, 30.0)),
+    Parameter("rate", 10.0, "largest rate of messages to Slicer [Hz]", range=(0.1, 30.0)),
     Parameter("tool", "tool", "name of the tool that is shown and moved"),
 )
 
 
 class SlicerBridge(ManagedNode):
-    """Sends what the cell publishes at display rate, and moves the tool by what it hears."""
+    """Sends the cell's data at display rate, and moves the tool by the received poses."""
 
     def __init__(self) -> None:
         self._link: Link | None = None
         self._follower = Follower()
-        self._asked: deque[str] = deque(maxlen=8)  # patients to build, as they were written
+        # requests to build patients, as they were written
+        self._asked: deque[str] = deque(maxlen=8)
         self._requests: Requests | None = None
         self._announced: list[Announced] = []
         self._own_subscriptions: list[Any] = []
@@ -58,10 +59,11 @@ class SlicerBridge(ManagedNode):
         self._frame = ""
         self._surface: tuple[np.ndarray, np.ndarray] | None = None  # vertices [m], polygons
         self._cloud: NewestCloud | None = None
-        self._client = 0  # that the organ at rest was sent to
+        self._client = 0  # client to which the organ at rest was sent
         super().__init__("slicer_bridge", SLICER_BRIDGE)
 
     def configure(self) -> None:
+        """Listen for Slicer, and subscribe the cell's topics."""
         tool = self.get_parameter("tool").value
         host, port = (self.get_parameter(name).value for name in ("host", "port"))
         try:
@@ -86,15 +88,18 @@ class SlicerBridge(ManagedNode):
         self.get_logger().info(f"3D Slicer may connect to {host}:{port}, in OpenIGTLinkIF")
 
     def activate(self) -> None:
+        """Start to send."""
         self._timer = self.create_timer(1.0 / self.get_parameter("rate").value, self._exchange)
 
     def deactivate(self) -> None:
+        """Stop sending and moving the tool."""
         if self._timer is not None:
             self.destroy_timer(self._timer)
             self._timer = None
         self._stop_driving()
 
     def clean_up(self) -> None:
+        """Close the connection and remove all topics."""
         if self._link is not None:
             self._link.close()
             self._link = None
@@ -114,7 +119,7 @@ class SlicerBridge(ManagedNode):
             self._cloud.close()
         self._cloud, self._client = None, 0
 
-    # --- what the cell says -----------------------------------------------------------------------
+    # --- from the cell ----------------------------------------------------------------------------
 
     def _take_frame(self, info: VademecumInfo) -> None:
         self._frame = info.header.frame_id
@@ -126,13 +131,13 @@ class SlicerBridge(ManagedNode):
         self._lay_out()
 
     def _lay_out(self) -> None:
-        """Once both messages have arrived, in either order; the surface itself has no frame."""
+        """Lay out the surface once mesh and frame have arrived, in either order."""
         if self._frame and self._surface is not None:
             self._forget()
             self._cloud = NewestCloud(self, self._frame, len(self._surface[0]))
 
     def _exchange(self) -> None:
-        """Send what is new, and see to what was heard."""
+        """Send new data, and handle received messages."""
         link = self._link
         if link is None or not link.is_connected:
             self._stop_driving()
@@ -152,7 +157,7 @@ class SlicerBridge(ManagedNode):
             self._build(self._asked.popleft())
 
     def _send_tool(self, link: Link) -> None:
-        """Pose and force of the tool."""
+        """Send pose and force of the tool."""
         pose, state = (_newest(subscription) for subscription in self._own_subscriptions)
         if pose is not None and pose.header.frame_id == self._frame:
             p, q = pose.pose.position, pose.pose.orientation
@@ -161,7 +166,7 @@ class SlicerBridge(ManagedNode):
         if state is not None and state.tool == self.get_parameter("tool").value:
             link.send(messages.text(messages.CONTACT, _line_of(state)))
 
-    # --- what the program says --------------------------------------------------------------------
+    # --- from the program -------------------------------------------------------------------------
 
     def _hear(self, message: Any) -> None:
         """Note a message; called in the link's thread."""
@@ -192,7 +197,7 @@ class SlicerBridge(ManagedNode):
         self._drive = publisher, self.create_timer(_DRIVE_PERIOD, move)
 
     def _stop_driving(self) -> None:
-        """Leave the tool to others; the contact node fades its force out."""
+        """Release the tool; the contact node fades its force out."""
         if self._drive is not None:
             publisher, timer = self._drive
             self.destroy_timer(timer)
@@ -201,7 +206,7 @@ class SlicerBridge(ManagedNode):
         self._follower.stop()
 
     def _build(self, asked: str) -> None:
-        """Build a patient of ``FILE [FIDELITY]``, and load it."""
+        """Build a patient from ``FILE [FIDELITY]``, and load it."""
         words = asked.split()
         fidelity = words.pop() if len(words) > 1 and words[-1] in _FIDELITIES else ""
         file = " ".join(words)
@@ -226,14 +231,14 @@ class SlicerBridge(ManagedNode):
 
 
 def _newest(subscription: Any) -> Any:
-    """The message that waits at a polled subscription, or None."""
+    """Return the message that waits at a polled subscription, or None."""
     with subscription.handle:
         taken = subscription.handle.take_message(subscription.msg_type, False)
     return None if taken is None else taken[0]
 
 
 def _line_of(state: ContactState) -> str:
-    """Force on the tool with its error, or why there is none."""
+    """Return the force on the tool with its error, or why there is none."""
     reason = explanation(state.status)
     if reason:
         return reason
@@ -247,10 +252,11 @@ def _line_of(state: ContactState) -> str:
 
 
 def _never_called(message: Any) -> None:
-    """Messages are taken, not delivered."""
+    """Do nothing: messages are taken, not delivered."""
 
 
 def main() -> int:
+    """Run the node; return the exit code."""
     return run(SlicerBridge)
 
 

@@ -47,6 +47,8 @@ VADEMECUM_LOADER = (
 
 @dataclass(frozen=True)
 class LoaderSettings:
+    """Parameters of the loader."""
+
     library_dir: str
     vademecum: str
     frame_id: str
@@ -54,6 +56,7 @@ class LoaderSettings:
 
 
 def read_loader(node: Node) -> LoaderSettings:
+    """Read the loader's parameters."""
     value = values(node, VADEMECUM_LOADER)
     return LoaderSettings(
         library_dir=os.path.expanduser(value["library_dir"]),
@@ -74,7 +77,7 @@ class LoaderNode(ManagedNode):
         self._outlets: dict[type, Any] = {}
         self._is_active = False
         super().__init__("vademecum_loader", VADEMECUM_LOADER)
-        # Exists as long as the node: an inactive one says so, where a client would wait for ever.
+        # exists as long as the node: while inactive it answers, so that no client waits for ever
         self.create_service(LoadVademecum, "load_vademecum", self._answer)
         self._beside = Beside(self, "calibration")
         self.create_service(
@@ -87,6 +90,7 @@ class LoaderNode(ManagedNode):
         self._state = SavedState(self, {"vademecum": started})
 
     def configure(self) -> None:
+        """Check the library, start the reader and make the topics."""
         self._settings = read_loader(self)
         if not os.path.isdir(self._settings.library_dir):
             raise ParameterError(
@@ -104,15 +108,18 @@ class LoaderNode(ManagedNode):
         }
 
     def activate(self) -> None:
+        """Load the first vademecum and accept requests."""
         assert self._settings is not None
         self._load_first(self._settings.vademecum)
         return_memory()
         self._is_active = True
 
     def deactivate(self) -> None:
+        """Refuse requests."""
         self._is_active = False
 
     def clean_up(self) -> None:
+        """Stop the processes and remove all topics."""
         if self._reader is not None:
             self._reader.close()
         if self._calibrator is not None:
@@ -124,10 +131,11 @@ class LoaderNode(ManagedNode):
 
     @property
     def has_pending_answers(self) -> bool:
+        """Return whether an answer is still to be sent."""
         return self._beside.n_awaited > 0
 
     def _load_first(self, name: str) -> None:
-        """Load the saved vademecum, or else that of the parameter."""
+        """Load the saved vademecum, or else the parameter's."""
         kept = self._state.load().get("vademecum", name)
         if kept != name:
             try:
@@ -143,7 +151,8 @@ class LoaderNode(ManagedNode):
 
         Raises
         ------
-        AvatarError : the file is refused; nothing was announced
+        AvatarError
+            If the file is refused; nothing was announced.
         """
         assert self._settings is not None and self._reader is not None
         data = read_in_library(name, self._settings.library_dir, self._settings.max_bytes)
@@ -171,7 +180,8 @@ class LoaderNode(ManagedNode):
             self._state.save({"vademecum": request.name})
             response.message = f"announced after {time.monotonic() - begin:.2f} s"
             response.success = True
-        except Exception as error:  # a service always answers; the file decides what is raised
+        # a service always answers; the file decides which error is raised
+        except Exception as error:
             response.message = one_line(error)
             self.get_logger().error(f"load_vademecum: {response.message}")
         return_memory()
@@ -193,6 +203,7 @@ class LoaderNode(ManagedNode):
 
 
 def main() -> int:
+    """Run the loader; return the exit code."""
     return run(LoaderNode)
 
 

@@ -1,8 +1,8 @@
 """Builds a patient's vademecum while the node continues to answer requests.
 
-A worker process (:mod:`avatar_ros.patients.worker`) keeps the atlas and does the work, which holds
-Python's global lock for seconds. Cancelling ends that process, whatever it does, and starts
-another. Only while it writes a file can it not be ended, so a file is complete or does not exist.
+A worker process (:mod:`avatar_ros.patients.worker`) keeps the atlas and builds, because that holds
+Python's global lock for seconds. Cancelling ends that process at any point, and starts another. The
+process cannot be ended only while it writes a file, so a file is complete or does not exist.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from avatar_ros.patients.protocol import (
     Stage,
 )
 
-_LATENCY = 0.05  # longest until a cancellation is noticed [s]
+_LATENCY = 0.05  # longest delay until a cancellation is noticed [s]
 _NOTHING = "; no file was written"
-_REPEAT = 0.5  # after which a stage is reported again, for clients that came late [s]
-_STOP_TIMEOUT = 5.0  # for writing a file, which is not interrupted [s]
+_REPEAT = 0.5  # time after which a stage is reported again, for late clients [s]
+_STOP_TIMEOUT = 5.0  # time for writing a file, which is not interrupted [s]
 
 
 class PatientBuilder:
@@ -60,16 +60,25 @@ class PatientBuilder:
         on_stage: Callable[[Stage], None],
         cancelled: Callable[[], bool] = lambda: False,
     ) -> Built | Previewed:
-        """Build and write one patient, or preview it; returns when that is done.
+        """Build and write one patient, or preview it; return when that is done.
 
-        on_stage : called in the caller's thread at each step of progress, at least twice a second
-        cancelled : called many times a second
+        Parameters
+        ----------
+        request : PatientRequest
+            Patient to build.
+        on_stage : callable
+            Called in the caller's thread at each step of progress, at least twice a second.
+        cancelled : callable
+            Returns whether to stop; called many times a second.
 
         Raises
         ------
-        BusyError : another patient is being built
-        CancelledError : nothing was written
-        BuildError : the request was refused, or the worker ended
+        BusyError
+            If another patient is being built.
+        CancelledError
+            If it was cancelled; nothing was written.
+        BuildError
+            If the request was refused, or the worker ended.
         """
         if not self._slot.acquire(blocking=False):
             raise self._busy()
@@ -88,14 +97,14 @@ class PatientBuilder:
             raise self._busy()
 
     def cancel(self) -> None:
-        """Cancel the build that is under way, if any; returns when it is over."""
+        """Cancel the running build, if any; return when it is over."""
         self._cancel.set()
         if self._slot.acquire(timeout=2 * _STOP_TIMEOUT):
             self._slot.release()
         self._cancel.clear()
 
     def stop(self) -> None:
-        """End the worker; a build that is under way is cancelled."""
+        """End the worker; a running build is cancelled."""
         self._stop.set()
         self.cancel()
         self._worker.finish(_STOP_TIMEOUT)
@@ -115,12 +124,12 @@ class PatientBuilder:
         ending = False
         stage, reported = Stage("loading", 0.0, float("nan")), time.monotonic()
         try:
-            self._worker.start()  # unless it runs
+            self._worker.start()  # starts only if it does not run
             self._worker.send(request)
             while True:
                 if not ending and (self._cancel.is_set() or cancelled()):
                     self._worker.send_signal(signal.SIGTERM)
-                    ending = True  # a file that it is writing is finished all the same
+                    ending = True  # a file that is being written is completed
                 if not self._worker.has_sent(_LATENCY):
                     if time.monotonic() - reported > _REPEAT:
                         on_stage(stage)
@@ -138,7 +147,7 @@ class PatientBuilder:
             if ending:
                 raise CancelledError(f"cancelled{_of_first(stage) or _NOTHING}") from error
             raise BuildError(
-                f"the building process ended ({error}), perhaps for want of memory"
+                f"the building process ended ({error}), perhaps because memory ran out"
                 f"{_of_first(stage) or _NOTHING}: ask again, or for fewer vertices"
             ) from error
         finally:
@@ -157,13 +166,13 @@ class PatientBuilder:
         raise BuildError(note.reason)
 
     def _restart(self) -> None:
-        """End the worker, and have another load the atlas for the next request."""
+        """End the worker, and start another, which loads the atlas for the next request."""
         self._worker.finish(_STOP_TIMEOUT)
         if not self._stop.is_set():
-            with contextlib.suppress(EndedError):  # the next request says so
+            with contextlib.suppress(EndedError):  # the next request reports it
                 self._worker.start()
 
 
 def _of_first(stage: Stage) -> str:
-    """What is said of the interpolated vademecum that was written first, if there is one."""
+    """Name the interpolated vademecum that was written first, if there is one."""
     return f"; {stage.file} holds the interpolated one" if stage.file else ""

@@ -1,4 +1,4 @@
-"""What the patient node asks of its worker process, and what that reports: pickled objects."""
+"""Packets between the patient node and its worker process: pickled objects."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.surface_formats import LABEL_MAPS
 
-# Regions of a face of a preview, as in BuildPatient.action; springs are numbered from the last on.
+# regions of a face of a preview, as in BuildPatient.action; further springs follow the last number
 FREE, CLAMPED, ACCESSIBLE, FIRST_SPRING = range(4)
 
 
@@ -19,21 +19,27 @@ class BuildError(AvatarError):
 
 
 class BusyError(BuildError):
-    """Another one is being built."""
+    """Another patient is being built."""
 
 
 class CancelledError(BuildError):
-    """It was cancelled before anything was written."""
+    """The build was cancelled before anything was written."""
 
 
 @dataclass(frozen=True)
 class BuildSettings:
-    """What is the same for all patients of a node.
+    """Settings that all patients of a node share.
 
-    atlas : path
-    n_vertices : of a patient's mesh
-    max_modes, weighting : see PatientOptions
-    n_certified : unseen loads of the certificate; -1 for the default of the fidelity
+    Attributes
+    ----------
+    atlas : str
+        Path of the atlas.
+    n_vertices : int
+        Approximate number of vertices of a patient's mesh.
+    max_modes, weighting : int, str
+        As in PatientOptions.
+    n_certified : int
+        Unseen loads of the certificate; -1 for the default of the fidelity.
     """
 
     atlas: str
@@ -47,16 +53,30 @@ class BuildSettings:
 class PatientRequest:
     """One patient; all paths are absolute.
 
-    surface : file, or empty if there are vertices, shape (n, 3) [m], and faces, shape (m, 3)
-    unit, axes : of the file; axes None for those that it states, else RAS
-    label, inside : of a label map, the organ and what lies inside; label None for the only one
-    groups : file of clamped, accessible and held points; empty for the template's
-    supports : as on the command line; empty for the clamp
-    preview : only register, mesh and clamp
-    interpolated_first : write an interpolated vademecum to the file, before a better one
-    neighbors : 0 for all
-    tolerance : 0 for the default
-    output : file to write
+    Attributes
+    ----------
+    surface : str
+        File; empty if arrays are given.
+    vertices, faces : ndarray, shapes (n, 3) and (m, 3), optional
+        Vertices [m] and triangles in place of a file.
+    unit, axes : str
+        Unit and axes of the file; axes None for those that it states, else RAS.
+    label, inside : str, tuple of str
+        Labels of the organ and of structures inside it; label None for the only one.
+    groups : str
+        File of clamped, accessible and held points; empty for the template's.
+    supports : tuple of str
+        Supports as on the command line; empty for the clamp.
+    preview : bool
+        Only register, mesh and clamp.
+    interpolated_first : bool
+        Write an interpolated vademecum to the file, before a better one.
+    neighbors : int
+        Number of neighbours; 0 for all.
+    tolerance : float
+        Tolerance; 0 for the default.
+    output : str
+        File to write.
     """
 
     surface: str
@@ -80,7 +100,7 @@ class PatientRequest:
 
 @dataclass(frozen=True)
 class Stage:
-    """The finished ``fraction`` of a ``stage``, and the ``error`` so far (NaN: unknown).
+    """Progress: the finished ``fraction`` of a ``stage``, and the ``error`` so far (NaN: unknown).
 
     file : interpolated vademecum that was written first; empty if there is none
     """
@@ -93,14 +113,14 @@ class Stage:
 
 @dataclass(frozen=True)
 class Ready:
-    """The atlas is loaded; so many of its anatomies have a response."""
+    """Report that the atlas is loaded, with the number of anatomies that have a response."""
 
     n_anatomies: int
 
 
 @dataclass(frozen=True)
 class BuildRefused:
-    """Nothing was written, for this reason."""
+    """Report that nothing was written, with the reason."""
 
     reason: str
 
@@ -109,10 +129,14 @@ class BuildRefused:
 class Previewed:
     """The surface of a patient's mesh and its regions; nothing was written.
 
-    vertices : ndarray, shape (n, 3) [m]; faces : (m, 3)
-    regions : ndarray of uint8, shape (m,): 0 free, 1 clamped, 2 accessible, 3 on the first of the
-        springs, and so on
-    missed : vertices [m] and faces of the patient's own surface that the mesh does not reach
+    Attributes
+    ----------
+    vertices, faces : ndarray, shapes (n, 3) and (m, 3)
+        Vertices [m] and triangles.
+    regions : ndarray of uint8, shape (m,)
+        0 free, 1 clamped, 2 accessible, 3 on the first of the springs, and so on.
+    missed : tuple of ndarray
+        Vertices [m] and faces of the patient's own surface that the mesh does not reach.
     """
 
     vertices: np.ndarray
@@ -125,7 +149,7 @@ class Previewed:
 
 @dataclass(frozen=True)
 class Built:
-    """What was written; fields as in InterpolatePatient.srv."""
+    """Report of a written vademecum; fields as in InterpolatePatient.srv."""
 
     vademecum_id: str
     file: str
@@ -140,9 +164,9 @@ class Built:
 
 
 def stem(name: str) -> str:
-    """The name of a surface's or a label map's file without its suffix, and with all other dots.
+    """Return the name of a file of a surface or label map without suffix, keeping all other dots.
 
-    Two studies called 1.2.840.17.nii.gz and 1.2.840.18.nii.gz are not one patient.
+    For example, 1.2.840.17.nii.gz and 1.2.840.18.nii.gz are two patients.
     """
     ends = sorted((*LABEL_MAPS, *(f".seg{end}" for end in LABEL_MAPS)), key=len)
     found = [end for end in ends if name.lower().endswith(end)]

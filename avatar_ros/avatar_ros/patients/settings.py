@@ -26,7 +26,7 @@ PATIENT_INTERPOLATION = (
     Parameter(
         "vertices", 2850, "approximate number of vertices of a patient's mesh", range=(100, 50_000)
     ),
-    Parameter("modes", 100, "largest number of modes at a place", range=(1, 1000)),
+    Parameter("modes", 100, "largest number of modes at one load position", range=(1, 1000)),
     Parameter(
         "weighting",
         "kriging",
@@ -53,11 +53,12 @@ class InterpolationSettings:
 
 
 def read_interpolation(node: Node) -> InterpolationSettings:
-    """The patient_interpolation node's parameters.
+    """Read the patient_interpolation node's parameters.
 
     Raises
     ------
-    ParameterError : naming the parameter and what it takes
+    ParameterError
+        If a value is not accepted; names the parameter and the accepted values.
     """
     value = values(node, PATIENT_INTERPOLATION)
     if not value["atlas"]:

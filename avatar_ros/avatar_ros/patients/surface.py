@@ -1,4 +1,4 @@
-"""The surface of a patient, from a file or from a message: both are checked alike."""
+"""The surface of a patient, from a file or from a message, with the same checks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from avatar_ros.patients.protocol import PatientRequest
 
 
 def read_confined(request: PatientRequest, reader: Reader) -> SurfaceMesh:
-    """What :func:`surface_of` returns, read in the process of a reader.
+    """Return :func:`surface_of`, read in the process of a reader.
 
     Raises AvatarError for anything but the surface of an organ.
     """
@@ -30,14 +30,14 @@ def read_confined(request: PatientRequest, reader: Reader) -> SurfaceMesh:
         return reader.read(
             "mesh", request.vertices.nbytes + request.faces.nbytes, surface_of, request
         )
-    # these may unpack to MAX_VOXEL_BYTES
+    # label maps may unpack to MAX_VOXEL_BYTES
     packed = is_label_map(Path(request.surface))
     n_bytes = MAX_VOXEL_BYTES if packed else os.path.getsize(request.surface)
     return reader.read(os.path.basename(request.surface), n_bytes, surface_of, request)
 
 
 def read_inside(request: PatientRequest, reader: Reader) -> tuple[SurfaceMesh, ...]:
-    """What lies inside the organ of a label map, by its labels, read in the process of a reader."""
+    """Read the structures inside the organ, by their labels, in the process of a reader."""
     name = os.path.basename(request.surface)
     return tuple(
         reader.read(name, MAX_VOXEL_BYTES, structure_of, request, label) for label in request.inside
@@ -45,13 +45,13 @@ def read_inside(request: PatientRequest, reader: Reader) -> tuple[SurfaceMesh, .
 
 
 def structure_of(request: PatientRequest, label: str) -> SurfaceMesh:
-    """The surface of one label, by that name."""
+    """Return the surface of one label, named after it."""
     found = read_tumour(request.surface, request.unit, request.axes, label)
     return replace(found, name=f"label {label}" if label.isdecimal() else label)
 
 
 def surface_of(request: PatientRequest) -> SurfaceMesh:
-    """The surface of the request's file or arrays.
+    """Return the surface of the request's file or arrays.
 
     Raises SurfaceError as ``read_surface`` does.
     """

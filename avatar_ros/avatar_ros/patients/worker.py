@@ -57,20 +57,20 @@ from avatar_ros.patients.protocol import (
 )
 from avatar_ros.patients.surface import read_confined, read_inside
 
-_MAX_BYTES = 1 << 30  # of a surface, unpacked
-_NICENESS = 10  # a contact loop on the same machine has precedence
+_MAX_BYTES = 1 << 30  # largest unpacked size of a surface [bytes]
+_NICENESS = 10  # gives way to a contact loop on the same machine
 
 
 @dataclass(frozen=True, eq=False)
 class LoadedAtlas:
-    """What patients are built from; ``volumes`` [m3] by name of the anatomy."""
+    """Atlas that patients are built from; ``volumes`` [m3] by name of the anatomy."""
 
     base: PatientBase
     volumes: dict[str, float]
 
     @classmethod
     def load(cls, path: str) -> LoadedAtlas:
-        """Raises AvatarError if the atlas cannot be read or has no responses."""
+        """Load the atlas; raise AvatarError if it cannot be read or has no responses."""
         atlas = load_atlas(path)
         return cls(base_of(atlas), {one.name: one.volume for one in atlas.anatomies})
 
@@ -82,11 +82,12 @@ def build(
     reader: Reader,
     connection: Connection,
 ) -> Built | Previewed:
-    """Build one patient and write it, or show what would hold it.
+    """Build one patient and write it, or preview its regions.
 
     Raises
     ------
-    AvatarError, OSError : nothing was written
+    AvatarError, OSError
+        If nothing was written.
     """
 
     first, base = "", atlas.base
@@ -124,7 +125,7 @@ def build(
 def write_first(
     surface: SurfaceMesh, base: PatientBase, options: PatientOptions, file: Path, report: Progress
 ) -> PatientBase:
-    """Write an interpolated vademecum; returns the base, which then knows the registration."""
+    """Write an interpolated vademecum; return the base, which then knows the registration."""
     problem, weights = posed_patient(surface, base, "interpolated", options, report)
     patient = build_patient(problem, base, weights, "interpolated", options, report)
     with _uninterrupted():
@@ -133,12 +134,12 @@ def write_first(
 
 
 def preview_of(problem: PatientProblem, supports: Sequence[SupportOption]) -> Previewed:
-    """The boundary of a patient's mesh with its regions."""
+    """Return the boundary of a patient's mesh with its regions."""
     vertices, faces = boundary(problem.mesh)
     regions = np.where(problem.regions.accessible, ACCESSIBLE, FREE)
     regions[problem.regions.clamped] = CLAMPED
     springs = {spring.name: spring.faces for spring in problem.elasticity.supports}
-    for k, support in enumerate(supports):  # those that are clamped are none
+    for k, support in enumerate(supports):  # clamped supports have no springs
         if support.name in springs:
             regions[springs[support.name]] = FIRST_SPRING + k
     notices = [*problem.surface.notices, *problem.notices, *problem.registration.notices]
@@ -153,7 +154,7 @@ def _groups(request: PatientRequest, reader: Reader) -> dict[str, np.ndarray] | 
 
 
 def require_replaceable(path: Path, reader: Reader) -> None:
-    """Raise BuildError unless there is nothing at the path, or a vademecum: an atlas must stay."""
+    """Raise BuildError unless the path is free or holds a vademecum: an atlas must stay."""
     if not os.path.lexists(path):
         return
     if not path.is_symlink() and path.is_file():
@@ -164,7 +165,7 @@ def require_replaceable(path: Path, reader: Reader) -> None:
 
 
 def volume_error(patient: Patient, volume: float, volumes: dict[str, float]) -> float:
-    """|sum w_j V_j / V - 1|: how well the weights that combine responses combine volumes [-]."""
+    """Return |sum w_j V_j / V - 1|: error of the responses' weights when applied to volumes [-]."""
     combined = sum(
         w * volumes[name] for name, w in zip(patient.neighbours, patient.weights, strict=True)
     )
@@ -172,7 +173,7 @@ def volume_error(patient: Patient, volume: float, volumes: dict[str, float]) -> 
 
 
 def displacement_error(patient: Patient) -> float:
-    """Measured by the certificate, else estimated, else NaN [-]."""
+    """Return the error that the certificate measured, else the estimate, else NaN [-]."""
     if patient.vademecum.certificate is not None:
         return float(patient.vademecum.certificate.l2_mean)
     return float(patient.estimates[-1].mean) if patient.estimates else math.nan
@@ -218,7 +219,7 @@ def _result_of(
 
 @contextlib.contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """SIGTERM has to wait: a file is written as a whole, and then reported."""
+    """Delay SIGTERM: a file is written as a whole, and then reported."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
     try:
         yield
@@ -227,7 +228,7 @@ def _uninterrupted() -> Iterator[None]:
 
 
 def serve(settings: BuildSettings, connection: Connection) -> None:
-    """Load the atlas, then build what is requested until the connection is closed."""
+    """Load the atlas, then build each request until the connection is closed."""
     try:
         atlas = LoadedAtlas.load(settings.atlas)
     except Exception as error:  # whatever a file provokes, the node reports it in one line
@@ -246,6 +247,7 @@ def serve(settings: BuildSettings, connection: Connection) -> None:
 
 
 def main() -> int:
+    """Serve as the worker process; return the exit code."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     realtime.die_with_parent(signal.SIGTERM)
     os.nice(_NICENESS)

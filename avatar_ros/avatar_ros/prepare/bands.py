@@ -1,8 +1,8 @@
-"""The bands of the forces of a model, in the worker process.
+"""Bands of a model's forces, in the worker process.
 
-They take a second or so for each organ, and next to nothing while a value changes of which the
-distribution is known. Core modules are imported where they are used, because the contact node needs
-none of them.
+They take about a second for each organ. While a value with a known distribution changes, they take
+next to no time. Core modules are imported where they are used, because the contact node needs none
+of them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class BandPreparer:
-    """Prepares bands, and keeps the edges for the last organ, tools and distributions."""
+    """Prepares bands; it keeps the edges for the last organ, tools and distributions."""
 
     def __init__(self) -> None:
         self._key: Any = None
@@ -30,14 +30,17 @@ class BandPreparer:
     def prepare(
         self, spec: ModelSpec, uncertainty: Mapping[str, Any]
     ) -> tuple[dict[str, Any], dict[str, np.ndarray], tuple[str, ...]]:
-        """What a model holds of its parameters, the arrays of its bands, and what is not used.
+        """Prepare the bands of a model.
 
         Returns
         -------
-        held : plain form of :class:`avatar_core.uncertainty.known.Held`
-        arrays : of :class:`avatar_core.contact.force_band.ForceBand`, by name; none without a
-            distribution that the vademecum has a place for
-        notices : on each of the others, a line
+        held : dict
+            Plain form of :class:`avatar_core.uncertainty.known.Held`.
+        arrays : dict
+            Arrays of :class:`avatar_core.contact.force_band.ForceBand`, by name; empty without a
+            usable distribution.
+        notices : tuple of str
+            One line on each unused distribution.
         """
         from avatar_core.contact.effects import Tumour
         from avatar_core.contact.effects.base import find
@@ -69,10 +72,10 @@ class BandPreparer:
 def usable_known(
     organ: str, held: Held, given: Mapping[str, Distribution]
 ) -> tuple[dict[str, Distribution], tuple[str, ...]]:
-    """Distributions that a vademecum has a place for, and what is said of each of the others.
+    """Split distributions into those that a vademecum can use, and notices on the others.
 
-    The node keeps its parameters from one organ to the next. Young's modulus comes first, as the
-    ranges of supports depend on it.
+    The node keeps its parameters from one organ to the next. Young's modulus comes first, because
+    the ranges of supports depend on it.
 
     organ : name of the vademecum
     """

@@ -1,7 +1,8 @@
-"""The packets between the contact node and the worker that prepares its models.
+"""Packets between the contact node and the worker that prepares its models.
 
-They travel as JSON through a SEQPACKET socket, which keeps their borders; the arrays of a model
-stay in shared memory, of which one file descriptor travels with the packet.
+They travel as JSON through a SEQPACKET socket, which keeps their borders. The arrays of a model
+stay
+in shared memory; one file descriptor of it travels with the packet.
 
 ====================  ==================  =====================================================
 sent by               packet              meaning
@@ -24,18 +25,20 @@ from typing import Any
 from avatar_ros.prepare.requests import Change, PreparationRequest, PreparedModel
 from avatar_ros.prepare.shared_arrays import map_shared
 
-_MAX_BYTES = 1 << 18  # of a packet: the longest scene, with its quotes escaped
+_MAX_BYTES = 1 << 18  # largest packet: the longest scene, with its quotes escaped [bytes]
 
 
 @dataclass(frozen=True)
 class ChangeRequest:
+    """Packet with a numbered change of the request."""
+
     number: int
     change: Change
 
 
 @dataclass(frozen=True)
 class ModelReady:
-    """Fields as in PreparedModel; ``contents`` says where each array lies in the shared memory."""
+    """Packet with a model: fields of PreparedModel; ``contents`` locates its shared arrays."""
 
     number: int
     change: Change
@@ -50,7 +53,7 @@ class ModelReady:
     held: dict[str, Any] = field(default_factory=dict)
 
     def map(self, handle: int) -> PreparedModel:
-        """The model, with its arrays mapped into this process; closes the descriptor."""
+        """Return the model with its arrays mapped into this process; close the descriptor."""
         return PreparedModel(
             self.id,
             self.name,
@@ -66,12 +69,16 @@ class ModelReady:
 
 @dataclass(frozen=True)
 class Accepted:
+    """Packet that accepts a change before there is a vademecum."""
+
     number: int
     change: Change
 
 
 @dataclass(frozen=True)
 class Refused:
+    """Packet that refuses a change, or with number 0 a vademecum."""
+
     number: int
     reason: str
 
@@ -91,22 +98,23 @@ class Channel:
 
     @staticmethod
     def pair() -> tuple[socket.socket, socket.socket]:
-        """Both ends of a new socket."""
+        """Return both ends of a new socket."""
         return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 
     def send(self, packet: Packet, *handles: int, wait: bool = True) -> None:
-        """Send a packet with file descriptors; ``wait``: for room in the socket.
+        """Send a packet with file descriptors; ``wait``: wait for room in the socket.
 
         Raises
         ------
-        OSError : the other end is closed, or the packet is too large or must not wait
+        OSError
+            If the other end is closed, or the packet is too large or must not wait.
         """
         text = json.dumps([type(packet).__name__, asdict(packet)], ensure_ascii=False)
         flags = 0 if wait else socket.MSG_DONTWAIT
         socket.send_fds(self._end, [text.encode(errors="replace")], handles, flags)
 
     def receive(self) -> tuple[Packet, list[int]] | None:
-        """The next packet and its file descriptors; None once the other end is closed."""
+        """Return the next packet and its file descriptors; None once the other end is closed."""
         data, handles, _, _ = socket.recv_fds(self._end, _MAX_BYTES, 1)
         if not data:
             return None

@@ -1,4 +1,4 @@
-"""What the process that prepares models is asked for, and what it supplies."""
+"""Request to the process that prepares models, and the model that it supplies."""
 
 from __future__ import annotations
 
@@ -13,17 +13,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PreparationRequest:
-    """What the worker prepares, and where it gets the vademecum.
+    """Model that the worker prepares, and source of its vademecum.
 
-    topic, node_name, namespace : of the worker's node
-    tips : fields of an avatar_core.geometry.tip.Tip for each tool; a scene with as many tools
-        replaces them
-    modes, cloud : of a model without a scene
-    period : of a step [s]
-    material : values by name of the coordinate; they override those of the scene
-    scene : YAML; empty for the natural effects of the vademecum
-    uncertainty : what is known of the material, as of
-        :func:`avatar_core.uncertainty.distributions.mappings`; empty for no bands
+    Attributes
+    ----------
+    topic, node_name, namespace : str
+        Topic of vademecums, and name of the worker's node.
+    tips : tuple of dict
+        Fields of an avatar_core.geometry.tip.Tip for each tool; a scene with as many tools replaces
+        them.
+    modes, cloud : int, str
+        Modes and cloud of a model without a scene.
+    period : float
+        Period of a step [s].
+    material : dict
+        Values by coordinate; they override those of the scene.
+    scene : str
+        YAML; empty for the natural effects of the vademecum.
+    uncertainty : dict
+        Distributions of the material, from :func:`avatar_core.uncertainty.distributions.mappings`;
+        empty for no bands.
     """
 
     topic: str
@@ -38,7 +47,7 @@ class PreparationRequest:
     uncertainty: dict[str, Any] = field(default_factory=dict)
 
 
-# Fields of a PreparationRequest; or scene_file, a path, in place of scene.
+# fields of a PreparationRequest; or scene_file, a path, in place of scene
 Change = dict[str, Any]
 
 
@@ -46,14 +55,23 @@ Change = dict[str, Any]
 class PreparedModel:
     """The contact model of a verified vademecum, as arrays in shared memory.
 
-    arrays : of the layout, and with bands those of
-        :class:`avatar_core.contact.force_band.ForceBand`
-    ranges : lowest and highest value of each coordinate of the vademecum
-    effects : names of the simulated effects
-    cloud_divisor : that of the scene; None without a scene
-    curve : plain form of the AccuracyCurve of the cloud; None if no errors were measured
-    notices : values of the material that this vademecum has no place for, one line each
-    held : plain form of the avatar_core.uncertainty.known.Held at the values in use
+    Attributes
+    ----------
+    arrays : dict
+        Arrays of the layout, and with bands those of
+        :class:`avatar_core.contact.force_band.ForceBand`.
+    ranges : dict
+        Lowest and highest value of each coordinate of the vademecum.
+    effects : tuple of str
+        Names of the simulated effects.
+    cloud_divisor : int, optional
+        Divisor of the scene; None without a scene.
+    curve : dict, optional
+        Plain form of the cloud's AccuracyCurve; None if no errors were measured.
+    notices : tuple of str
+        Values of the material that this vademecum cannot use, one line each.
+    held : dict
+        Plain form of the avatar_core.uncertainty.known.Held at the values in use.
     """
 
     id: str

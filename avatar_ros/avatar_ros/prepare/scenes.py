@@ -1,4 +1,4 @@
-"""Scenes of the contact node: where they are found, and the models that they specify."""
+"""Scenes of the contact node: their files, and the models that they specify."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def scene_file(value: str) -> Path:
-    """The file that the parameter ``scene`` names: a path if it has a /, else a shipped scene.
+    """Return the file named by the parameter ``scene``: a path if it has a /, else a shipped scene.
 
     Raises SceneError if there is no shipped scene of this name.
     """
@@ -27,12 +27,12 @@ def scene_file(value: str) -> Path:
 
 
 def change_of(request: Any) -> dict[str, Any]:
-    """What a request of load_scene changes in the PreparationRequest.
+    """Return the change of the PreparationRequest that a request of load_scene asks for.
 
     Raises
     ------
     SceneError
-        Neither or both of the fields are given, or the name is not that of a shipped scene.
+        If neither or both of the fields are given, or no shipped scene has this name.
     """
     if bool(request.yaml) == bool(request.name):
         both = "not both" if request.yaml else "both are empty"
@@ -49,12 +49,13 @@ def change_of(request: Any) -> dict[str, Any]:
 def usable_material(
     vademecum: Vademecum, material: dict[str, float]
 ) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Values that a vademecum has a coordinate for, and what is said of each of the others.
+    """Split values into those that a vademecum can use, and notices on the others.
 
-    The node keeps its parameters from one organ to the next, and the next may be of another range.
-    On supports, Young's modulus is left out where their stiffness over it would be out of range.
+    The node keeps its parameters from one organ to the next, whose ranges may differ. With
+    supports,
+    Young's modulus is left out where their stiffness relative to it would be out of range.
 
-    material : values by name of the coordinate [SI]
+    material : values by coordinate [SI]
     """
     own = vademecum.material.young_modulus
     others = {name: value for name, value in material.items() if name != "young"}
@@ -72,7 +73,7 @@ def usable_material(
 
 
 def _ranges_at(vademecum: Vademecum, young: float) -> dict[str, tuple[float, float]]:
-    """Of each coordinate at a Young's modulus [Pa], over which the stiffness of supports counts."""
+    """Return the range of each coordinate at a Young's modulus [Pa], which scales supports."""
     parametric = vademecum.parametric
     if parametric is None:
         return {}
@@ -86,7 +87,7 @@ def _ranges_at(vademecum: Vademecum, young: float) -> dict[str, tuple[float, flo
 def _within(
     organ: str, material: dict[str, float], ranges: dict[str, tuple[float, float]]
 ) -> tuple[dict[str, float], list[str]]:
-    """Values within ranges, and a line for each of the others."""
+    """Split values into those within ranges, and a line for each of the others."""
     used, notices = {}, []
     for name, value in material.items():
         if name not in ranges:
@@ -103,7 +104,7 @@ def _within(
 def _holds(
     vademecum: Vademecum, material: dict[str, float], ranges: dict[str, tuple[float, float]]
 ) -> bool:
-    """Whether all supports, those that are not chosen too, are coordinates within their ranges."""
+    """Return whether all supports, also those not chosen, are coordinates within their ranges."""
     for support in vademecum.supports:
         name = SUPPORT + support.name
         low, high = ranges.get(name, (1.0, 0.0))
@@ -113,14 +114,14 @@ def _holds(
 
 
 def model_spec(vademecum: Vademecum, request: PreparationRequest, scene: Scene | None) -> ModelSpec:
-    """What a request and a scene make of a vademecum; the request's material overrides the scene's.
+    """Combine request, scene and vademecum; the request's material overrides the scene's.
 
     Raises
     ------
     AvatarError
-        The vademecum cannot serve this; with the remedy.
+        If the vademecum cannot serve this; the message names the remedy.
     """
-    # Here, because the contact node imports this file and needs none of that.
+    # imported here: the contact node imports this file and needs none of these
     from avatar_core.scene.prepare import default_spec, scene_spec
 
     if scene is not None:

@@ -11,15 +11,15 @@ import numpy as np
 
 from avatar_ros.framework import realtime
 
-_ALIGNMENT = 64  # of every array [bytes]
+_ALIGNMENT = 64  # alignment of every array [bytes]
 _SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE
 
 
 def write_shared(arrays: dict[str, np.ndarray]) -> tuple[int, list[dict[str, Any]]]:
-    """Copy arrays into sealed anonymous shared memory; returns its descriptor and its contents.
+    """Copy arrays into sealed anonymous shared memory; return its descriptor and its contents.
 
-    Once it is sealed, neither process can change or shorten it, so a fault in one cannot reach the
-    other through it.
+    After sealing, neither process can change or shorten the memory, so a fault in one cannot reach
+    the other through it.
     """
     contents = []
     end = 0
@@ -39,9 +39,9 @@ def write_shared(arrays: dict[str, np.ndarray]) -> tuple[int, list[dict[str, Any
 
 
 def map_shared(handle: int, contents: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Map shared arrays, private to this process, with all pages present; closes the descriptor."""
+    """Map shared arrays, private to this process, with all pages present; close the descriptor."""
     try:
-        # Writable, but a private copy: jitted code compiled for ordinary arrays accepts it.
+        # writable, but a private copy: jitted code compiled for ordinary arrays accepts it
         memory = mmap.mmap(handle, 0, mmap.MAP_PRIVATE, mmap.PROT_READ | mmap.PROT_WRITE)
     finally:
         os.close(handle)

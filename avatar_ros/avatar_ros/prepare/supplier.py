@@ -1,10 +1,10 @@
 """Supplies the contact node with prepared models, without delaying its loop.
 
-Deserialising 40 MB, verifying them and preparing the contact model would each hold Python's
-global lock for tens of milliseconds; compiling the step, once on a machine, for tens of seconds.
-A worker process (:mod:`avatar_ros.prepare.worker`) does all that: it subscribes to `vademecum` and
-puts the prepared arrays into sealed shared memory. This process only maps that memory, and reads
-the compiled step from numba's cache.
+Deserialising 40 MB, verifying them and preparing the contact model would each hold Python's global
+lock for tens of milliseconds. Compiling the step takes tens of seconds, once on a machine. A worker
+process (:mod:`avatar_ros.prepare.worker`) does all that: it subscribes to `vademecum` and puts the
+prepared arrays into sealed shared memory. This process only maps that memory, and reads the
+compiled step from numba's cache.
 """
 
 from __future__ import annotations
@@ -22,24 +22,28 @@ from avatar_ros.prepare.requests import Change, PreparationRequest, PreparedMode
 
 _RESTART_DELAY = 1.0  # [s]
 _STOP_TIMEOUT = 1.0  # [s]
-_KINDS = ("material", "uncertainty")  # of changes, besides scenes
+_KINDS = ("material", "uncertainty")  # kinds of changes, besides scenes
 
-# Called with the model now in use and "", or with None and the reason of a refusal. None and "":
-# there is no vademecum yet, and the change applies to the next one.
+# called with the model now in use and "", or with None and the reason of a refusal; None and "":
+# there is no vademecum yet, and the change applies to the next one
 Answer = Callable[[PreparedModel | None, str], None]
 
 SUPERSEDED = "superseded by a later change, which is tried instead"
 
 
 class ModelSupplier:
-    """Keeps the worker running and calls back with what it prepared.
+    """Keeps the worker running and calls back with prepared models.
 
     Callbacks run in a thread of this object, one at a time. Changes are sent one by one, each
-    after the last one was answered. Of the changes that wait, only the newest of each kind (scene,
-    material, uncertainty) is kept, so dragging a slider fills neither time nor memory.
+    after the last one was answered. Only the newest waiting change of each kind (scene, material,
+    uncertainty) is kept, so dragging a slider fills neither time nor memory.
 
-    on_model : called with each model that was verified and prepared; puts it into use
-    on_refusal : called with one line when a vademecum is refused or the worker ends
+    Parameters
+    ----------
+    on_model : callable
+        Called with each verified and prepared model; puts it into use.
+    on_refusal : callable
+        Called with one line when a vademecum is refused or the worker ends.
     """
 
     def __init__(
@@ -48,14 +52,14 @@ class ModelSupplier:
         on_model: Callable[[PreparedModel], None],
         on_refusal: Callable[[str], None],
     ) -> None:
-        self._request = request  # in force; a restarted worker begins with it
+        self._request = request  # request in force; a restarted worker begins with it
         self._on_model = on_model
         self._on_refusal = on_refusal
         self._stop = threading.Event()
         self._lock = threading.Lock()  # guards the next four
         self._channel: Channel | None = None
-        self._waiting: dict[str, tuple[Change, Answer]] = {}  # by kind
-        self._pending: Answer | None = None  # of the change that was sent last
+        self._waiting: dict[str, tuple[Change, Answer]] = {}  # waiting changes by kind
+        self._pending: Answer | None = None  # answer to the change that was sent last
         self._number = 0
         self._worker = Child("avatar_ros.prepare.worker")
         self._thread = threading.Thread(target=self._supervise, name="model supplier", daemon=True)
@@ -63,11 +67,11 @@ class ModelSupplier:
 
     @property
     def scene(self) -> str:
-        """YAML of the scene in force; empty for the natural effects of the vademecum."""
+        """Return the YAML of the scene in force; empty for the natural effects of the vademecum."""
         return self._request.scene
 
     def ask(self, change: Change, answer: Answer) -> None:
-        """Have the vademecum prepared with a changed request; returns at once.
+        """Prepare the vademecum again with a changed request; return at once.
 
         A waiting change of the same kind is refused as ``SUPERSEDED``, in the caller's thread.
         """
@@ -80,7 +84,7 @@ class ModelSupplier:
         self._send_next()
 
     def stop(self) -> None:
-        """End the worker; returns when it has ended."""
+        """End the worker; return when it has ended."""
         self._stop.set()
         self._worker.finish(_STOP_TIMEOUT)
         self._thread.join(_STOP_TIMEOUT)
@@ -103,7 +107,7 @@ class ModelSupplier:
             self._send_next()
 
     def _supervise(self) -> None:
-        """Start the worker, and start it again whenever it ends, until :meth:`stop`."""
+        """Start the worker, and restart it whenever it ends, until :meth:`stop`."""
         while not self._stop.is_set():
             ours, theirs = Channel.pair()
             with ours:
@@ -111,7 +115,7 @@ class ModelSupplier:
                 with self._lock:
                     self._channel = None
                     answer, self._pending = self._pending, None
-            if answer is not None:  # not sent again: it may be what ended the worker
+            if answer is not None:  # not sent again: it may have ended the worker
                 answer(None, "the process that prepares models ended; ask again")
             if not self._stop.is_set():
                 self._on_refusal("the process that receives vademecums ended; starting another")
@@ -144,7 +148,7 @@ class ModelSupplier:
                     self._conclude(number, {}, None, reason)
 
     def _use(self, ready: ModelReady, handle: int) -> None:
-        """Have a model put into use; if that fails, the last one stays."""
+        """Put a model into use; if that fails, the last one stays."""
         try:
             model = ready.map(handle)
             self._on_model(model)
@@ -156,7 +160,7 @@ class ModelSupplier:
     def _conclude(
         self, number: int, change: Change, model: PreparedModel | None, reason: str = ""
     ) -> None:
-        """Note and report what came of a change, or of a vademecum (number 0)."""
+        """Note and report the outcome of a change, or of a vademecum (number 0)."""
         self._request = replace(self._request, **change)
         if number == 0:
             if reason:

@@ -1,4 +1,4 @@
-"""The worker process that receives vademecums, verifies them and prepares their contact models.
+"""Worker process that receives vademecums, verifies them and prepares their contact models.
 
 Run as ``python -m avatar_ros.prepare.worker`` by
 :class:`avatar_ros.prepare.supplier.ModelSupplier`, never by hand.
@@ -32,13 +32,13 @@ from avatar_ros.prepare.protocol import (
 from avatar_ros.prepare.requests import Change, PreparationRequest
 from avatar_ros.prepare.shared_arrays import map_shared, write_shared
 
-_MAX_NAME = 80  # letters quoted of a name from elsewhere
-_MAX_BYTES = 1 << 30  # of a vademecum that can be received
+_MAX_NAME = 80  # longest part of a foreign name that is quoted [characters]
+_MAX_BYTES = 1 << 30  # largest vademecum that can be received [bytes]
 _PARSE = Imported("avatar_core.vademecum.storage", "parse_vademecum")
 
 
 class ModelPreparer:
-    """Verifies and prepares what comes in, and reports through a socket.
+    """Verifies and prepares received vademecums, and reports through a socket.
 
     Vademecums come in the thread of the node, changes of the request in that of :meth:`listen`.
     """
@@ -52,7 +52,7 @@ class ModelPreparer:
         self._lock = threading.Lock()
 
     def expect(self) -> None:
-        """Have the process that verifies started before a vademecum comes; returns at once."""
+        """Start the verifying process before a vademecum comes; return at once."""
         loads = threading.Thread(target=self._reader.load, args=[_PARSE], daemon=True)
         loads.start()
 
@@ -119,8 +119,8 @@ class ModelPreparer:
         held, bands, unused = self._bands.prepare(spec, request.uncertainty)
         handle, contents = write_shared(flat(spec.layout(spec.finest, request.period)) | bands)
         try:
-            # Compiles the step, if that was never done on this machine: the node then finds it in
-            # numba's cache.
+            # compiles the step, if that was never done on this machine: the node then finds it in
+            # numba's cache
             arrays = map_shared(os.dup(handle), contents)
             ForceBand.of(ContactModel(gathered(MODEL, arrays)).data(), arrays)
             ready = ModelReady(
@@ -148,7 +148,7 @@ class ModelPreparer:
 
 
 def _with_scene_text(change: Change) -> Change:
-    """The change with its scene checked and complete: no file has to be read for it again."""
+    """Return the change with its scene checked and complete, so that no file is read again."""
     from avatar_core.scene.file import parse_scene, read_scene, write_scene
 
     if "scene_file" in change:
@@ -162,12 +162,12 @@ def _verified(identity: str, data: bytes, reader: Reader) -> Any:
     origin = "the received vademecum"
     vademecum = reader.read(origin, len(data), _PARSE, data, origin)
     if vademecum.id != identity:
-        raise ValueError("altered on the way, its checksum differs: load it again")
+        raise ValueError("altered in transport, its checksum differs: load it again")
     return vademecum
 
 
 def _import_libraries() -> None:
-    """Import what preparing needs, while another process verifies; not before, for the memory."""
+    """Import the libraries while another process verifies; not before, to save memory."""
     from avatar_core.common.jit import load_compiler
     from avatar_core.contact import model  # noqa: F401
     from avatar_ros.prepare import scenes  # noqa: F401
@@ -176,12 +176,13 @@ def _import_libraries() -> None:
 
 
 def _listen(preparer: ModelPreparer) -> None:
-    """Until the contact node is gone; then end at once, whatever is being prepared for it."""
+    """Listen until the contact node is gone; then end at once, even while preparing."""
     preparer.listen()
     os._exit(0)
 
 
 def main() -> int:
+    """Serve as the worker process; return the exit code."""
     realtime.die_with_parent(signal.SIGTERM)
     realtime.release()
     import rclpy

@@ -1,1 +1,1 @@
-"""3D Slicer beside the cell, over OpenIGTLink: the connection, and what is sent either way."""
+"""3D Slicer next to the cell, over OpenIGTLink: the connection and the messages."""

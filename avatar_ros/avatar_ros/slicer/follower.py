@@ -1,7 +1,7 @@
-"""A tool that follows poses which come seldom, without leaps.
+"""Smooth motion of a tool between poses that arrive slowly.
 
-A program that is driven by a mouse sends some 30 poses a second, and none while nothing moves; a
-contact node wants more than 100. Between two of them the tool moves evenly, a pose late.
+A program driven by a mouse sends some 30 poses a second, and none while nothing moves; a contact
+node wants more than 100. Between two of them the tool moves evenly, one pose late.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import threading
 
 import numpy as np
 
-LONGEST = 0.1  # that a way to a new pose takes [s]
+LONGEST = 0.1  # longest time for the way to a new pose [s]
 
 
 class Follower:
@@ -20,11 +20,11 @@ class Follower:
         self._lock = threading.Lock()
         self._from: np.ndarray | None = None  # position and quaternion, (7,)
         self._to = np.zeros(7)
-        self._begin, self._takes = 0.0, 0.0  # of the way [s]
+        self._begin, self._takes = 0.0, 0.0  # begin and duration of the way [s]
 
     @property
     def has_target(self) -> bool:
-        """Whether a pose has come."""
+        """Return whether a pose has come."""
         return self._from is not None
 
     def follow(self, position: np.ndarray, quaternion: np.ndarray, now: float) -> None:
@@ -38,7 +38,7 @@ class Follower:
             self._from, self._to, self._begin = start, target, now
 
     def at(self, now: float) -> tuple[np.ndarray, np.ndarray]:
-        """Position [m] and unit quaternion at a time [s]."""
+        """Return position [m] and unit quaternion at a time [s]."""
         with self._lock:
             place = self._at(now)
         return place[:3], place[3:] / np.linalg.norm(place[3:])

@@ -3,8 +3,8 @@
 The messages are those of pyigtl (protocol: openigtlink.org, version 3). Its server is not used: it
 takes the signals of the process, reads bodies of any size, and keeps a client that has left.
 
-Two threads: one accepts a client and reads, one writes. Of several messages for one device that
-wait to be sent, the newest is: a program that is slow to read gets fewer pictures, not old ones.
+One thread accepts a client and reads, another writes. If several messages for one device wait, only
+the newest is sent: a slow program gets fewer pictures, not old ones.
 """
 
 from __future__ import annotations
@@ -17,28 +17,34 @@ from contextlib import suppress
 from pyigtl import StringMessage, TransformMessage
 from pyigtl.messages import MessageBase
 
-MAX_BODY = 1 << 16  # of a message that is read; a transform has 48 bytes
-_HEARD = {"TRANSFORM": TransformMessage, "STRING": StringMessage}  # all others are skipped
-_VERSIONS = (1, 2)  # of the header; the second is that of protocol 3
-_POLL = 0.2  # between looks whether to end [s]
+MAX_BODY = 1 << 16  # largest message that is read [bytes]; a transform has 48
+_HEARD = {"TRANSFORM": TransformMessage, "STRING": StringMessage}  # all other messages are skipped
+_VERSIONS = (1, 2)  # versions of the header; the second is that of protocol 3
+_POLL = 0.2  # period of checks whether to end [s]
 _CHUNK = 1 << 16
-_SEND_TIMEOUT = 5.0  # for a client that does not read, before it is dropped [s]
+_SEND_TIMEOUT = 5.0  # time for a client that does not read, before it is dropped [s]
 
 
 class LinkError(Exception):
-    """What a client sent is no OpenIGTLink."""
+    """Data from a client that are no OpenIGTLink."""
 
 
 class Link:
-    """Listens until :meth:`close`.
-
-    n_clients : how many have connected so far; it rises when there is a new one
+    """Server that listens until :meth:`close`.
 
     Parameters
     ----------
-    host, port : where to listen; port 0: any that is free
-    hear : called with each transform or string that comes, in a thread of its own
-    report : called with one line when a client comes, leaves or is dropped, likewise
+    host, port : str, int
+        Address to listen on; port 0: any free one.
+    hear : callable
+        Called with each received transform or string, in a separate thread.
+    report : callable
+        Called with one line when a client comes, leaves or is dropped, in a separate thread.
+
+    Attributes
+    ----------
+    n_clients : int
+        Number of clients that have connected so far.
 
     Raises
     ------
@@ -70,16 +76,16 @@ class Link:
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """Return the port that it listens on."""
         return int(self._listener.getsockname()[1])
 
     @property
     def is_connected(self) -> bool:
-        """Whether there is a client."""
+        """Return whether there is a client."""
         return self._client is not None
 
     def send(self, message: MessageBase) -> None:
-        """Have a message written, instead of one for its device that waits; returns at once."""
+        """Queue a message, in place of a waiting one for its device; return at once."""
         if not self.is_connected:
             return
         packed = message.pack()
@@ -115,7 +121,7 @@ class Link:
             self._drop()
 
     def _read(self, client: socket.socket) -> str:
-        """Read what comes until the client leaves; returns why it ended."""
+        """Read until the client leaves; return why it ended."""
         try:
             while not self._is_closing:
                 self._take(client)
@@ -132,7 +138,7 @@ class Link:
             kind, size = fields["message_type"], fields["body_size"]
         except Exception as error:
             raise LinkError("it does not speak OpenIGTLink") from error
-        if fields["header_version"] not in _VERSIONS:  # a website, for one
+        if fields["header_version"] not in _VERSIONS:  # e.g. a website
             raise LinkError("it does not speak OpenIGTLink")
         if kind not in _HEARD:
             _skip(client, size)
@@ -162,7 +168,7 @@ class Link:
                 self._drop()
 
     def _drop(self) -> None:
-        """Let the client go; its reader notices."""
+        """Disconnect the client; its reader notices."""
         with self._change:
             client, self._client = self._client, None
             self._waiting.clear()
@@ -173,7 +179,7 @@ class Link:
 
 
 def _exactly(client: socket.socket, size: int) -> bytes:
-    """The next ``size`` bytes, however long they take to come."""
+    """Return the next ``size`` bytes, however long they take to come."""
     received = bytearray()
     while len(received) < size:
         received += _some(client, size - len(received))
@@ -190,7 +196,7 @@ def _some(client: socket.socket, most: int) -> bytes:
         try:
             chunk = client.recv(min(most, _CHUNK))
         except TimeoutError:
-            continue  # nothing was said for a while
+            continue  # nothing came for a while
         if not chunk:
             raise EOFError
         return chunk
