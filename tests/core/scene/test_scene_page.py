@@ -1,4 +1,4 @@
-"""The page of scenes has every key, with the unit, range and default of the code."""
+"""The page of scenes has every key, with the default, range and unit of the code."""
 
 from __future__ import annotations
 
@@ -19,14 +19,10 @@ PAGE = (ROOT / "msg_docs" / "interfaces" / "scene_file.md").read_text()
 WORDS = {"the vademecum's", "none", "all"}  # of a default that is None
 
 
-def rows() -> dict[str, list[str]]:
-    """Unit, range and default by key."""
-    found = {}
-    for line in PAGE.splitlines():
-        if line.startswith("| `"):
-            key, *cells = (cell.strip() for cell in line.strip("|").split("|"))
-            found[key.strip("`")] = cells[:3]
-    return found
+def rows() -> dict[str, tuple[str, str]]:
+    """Default and range with unit by key."""
+    row = re.compile(r"^\| `(\S+)` \| (.*?) ?(?:\((\S+ to [^)]*)\) )?\|", re.MULTILINE)
+    return {key: (default, span) for key, default, span in row.findall(PAGE)}
 
 
 def keys() -> Iterator[tuple[str, Field[Any] | None]]:
@@ -54,14 +50,15 @@ def keys() -> Iterator[tuple[str, Field[Any] | None]]:
 
 @pytest.mark.parametrize(("key", "item"), [*keys()], ids=lambda value: value if value else "")
 def test_a_key_is_as_the_page_says(key: str, item: Field[Any] | None) -> None:
-    unit, span, default = rows()[key]
+    default, span = rows()[key]
     if item is None:
         return
     of_supports = next(f for f in fields(SupportStiffness) if f.name == "stiffness")
     number = of_supports if key == "material.supports" else item
     if "quantity" in number.metadata:
         allowed = number.metadata["quantity"]
-        assert (unit, span) == (allowed.unit, f"{allowed.low:g} to {allowed.high:g}")
+        unit = f" {allowed.unit}".removesuffix(" -")
+        assert span == f"{allowed.low:g} to {allowed.high:g}{unit}"
     if item.default is MISSING:
         assert default in ("required", "") or key.endswith(".name")
     elif item.default is None or item.default == ():

@@ -20,13 +20,18 @@ COMMON_SERVICES = re.compile(
 
 
 def index() -> list[dict[str, str]]:
-    """Rows of the index: interface, page, kind, type, node, direction."""
+    """Rows of the index: interface, page, kind, type, node, direction. A heading names the node."""
     row = re.compile(
-        r"^\| \[`(?P<interface>[^`]+)`\]\((?P<page>[^)]+)\) \| (?P<kind>\w+)"
-        r" \| `(?P<type>[^`]+)` \| `(?P<node>[^`]+)` \| (?P<direction>\w+) \|$",
+        r"^\| \[`(?P<interface>[^`]+)`\]\((?P<page>[^)]+)\)"
+        r" \| `(?P<type>\w+/(?P<kind>\w+)/\w+)` \| (?P<direction>\w+) \|$",
         re.MULTILINE,
     )
-    return [found.groupdict() for found in row.finditer((PAGES / "README.md").read_text())]
+    sections = (PAGES / "README.md").read_text().split("\n## ")[1:]
+    return [
+        {**found.groupdict(), "node": section.split("\n")[0]}
+        for section in sections
+        for found in row.finditer(section)
+    ]
 
 
 def entry(page: str, key: str) -> str:
@@ -60,25 +65,39 @@ def offered(graph: Any, node: str) -> set[tuple[str, str, str]]:
 
 
 def parameter_rows(node: str) -> dict[str, str]:
-    """Name of each documented parameter, and the rest of its row."""
+    """Name of each documented parameter, and the rest of its row.
+
+    A row of ``support.NAME`` or ``missed.LEVEL`` stands for each name in its code spans.
+    """
     page = (PAGES / "parameters.md").read_text()
     section = page.split(f"## {node}\n")[1].split("\n## ")[0]
-    return dict(re.findall(r"^\| `([^`]+)` (\|.*)$", section, re.MULTILINE))
+    rows = {}
+    for parameter, rest in re.findall(r"^\| `([^`]+)` (\|.*)$", section, re.MULTILINE):
+        names = re.findall(r"`(\w+)`", rest) if re.search("NAME|LEVEL", parameter) else [""]
+        rows |= {re.sub("NAME|LEVEL", name, parameter): rest for name in names}
+    return rows
 
 
 def quality_rows(node: str) -> dict[str, str]:
-    """Of a node's topics: each ``qos_overrides`` parameter and the default that the page says."""
-    cells = r"`([^`]+)` \| (subscription|publisher) \| (.+) \| (.+) \| (.+) \| (.+)"
-    page = (PAGES / "parameters.md").read_text()
+    """Of a node's topics: each ``qos_overrides`` parameter and the default that its page says."""
     found = {}
-    own = {row["interface"] for row in index() if row["node"] == node}
-    for interface, side, *values in re.findall(rf"^\| {cells} \|$", page, re.MULTILINE):
-        if interface not in own:
+    for row in index():
+        said = entry(row["page"], "QoS") if row["node"] == node and row["kind"] == "msg" else ""
+        if "[Overrides]" not in said:
             continue
-        name = f"qos_overrides.{topic({'interface': interface})}.{side}"
-        policies = ("reliability", "durability", "depth", "deadline")
-        for policy, value in zip(policies, values, strict=True):
-            found[f"{name}.{policy}"] = re.split(r"[ ,]", value)[0]
+        side = "subscription" if row["direction"] == "in" else "publisher"
+        depth, deadline = re.search(r"depth (\d+)", said), re.search(r"\(([\d.]+) ms\)", said)
+        assert depth, row["page"]
+        reliability, durability = said.split(".")[0].lower().split(", ")[:2]
+        found |= {
+            f"qos_overrides.{topic(row)}.{side}.{policy}": value
+            for policy, value in (
+                ("reliability", reliability),
+                ("durability", durability),
+                ("depth", depth[1]),
+                ("deadline", f"{float(deadline[1]) * 1e6:.0f}" if deadline else "0"),
+            )
+        }
     return found
 
 

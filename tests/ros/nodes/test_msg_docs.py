@@ -70,13 +70,13 @@ def running(cell: Any, probe: Any) -> Any:
 @pytest.mark.parametrize("row", index(), ids=lambda row: row["interface"])
 def test_every_page_is_complete(row: dict[str, str]) -> None:
     assert f"# {row['interface']}\n" in (PAGES / row["page"]).read_text()
-    assert row["type"] in entry(row["page"], "Type")
-    for key in ("Kind", "QoS", "Rate", "Frame", "Units"):
+    assert {row["type"], row["node"]} <= set(re.findall(r"`([^`]+)`", entry(row["page"], "Type")))
+    for key in ("QoS", "Rate", "Frame", "Units"):
         assert entry(row["page"], key)
 
 
 def test_every_page_is_in_the_index() -> None:
-    pages = {page.name for page in PAGES.glob("*.md") if "\n- **Kind**:" in page.read_text()}
+    pages = {page.name for page in PAGES.glob("*.md") if "\n- **Type**:" in page.read_text()}
     assert pages == {row["page"] for row in index()}
 
 
@@ -93,7 +93,7 @@ def test_topics_and_services_are_those_of_the_pages(graph: Any, node: str) -> No
 
 
 @pytest.mark.parametrize(
-    "row", [row for row in index() if row["kind"] == "topic"], ids=lambda row: row["interface"]
+    "row", [row for row in index() if row["kind"] == "msg"], ids=lambda row: row["interface"]
 )
 def test_quality_of_service_is_that_of_the_page(graph: Any, row: dict[str, str]) -> None:
     look = (
@@ -124,7 +124,7 @@ def test_parameters_are_those_of_the_page(running: Any, node: str) -> None:
     described = running.ask(DescribeParameters, f"/{node}/describe_parameters", request)
     for descriptor in described.descriptors:
         assert descriptor.description
-        changeable = "may change while running" in rows[descriptor.name]
+        changeable = "*live*" in rows[descriptor.name]
         assert descriptor.read_only != changeable, descriptor.name
 
 
