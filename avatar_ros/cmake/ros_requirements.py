@@ -19,9 +19,10 @@ def _without_ros() -> bool:
 
 
 def dynamic_metadata(settings: Mapping[str, Any], project: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the requirements of a project without ROS wheels, or with them."""
     return {"dependencies": [] if _without_ros() else settings["dependencies"]}
 
 
 def dynamic_wheel(settings: Mapping[str, Any]) -> dict[str, bool]:
-    # An sdist does not decide: the environment its wheel is built in does.
+    """Return the fields whose value the environment of the wheel's build decides."""
     return {"dependencies": True}

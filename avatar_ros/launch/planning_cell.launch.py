@@ -15,7 +15,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-# As in avatar_ros.nodes.cell, which the Python of `ros2 launch` need not be able to import.
+# as in avatar_ros.nodes.cell, which the Python of `ros2 launch` may not be able to import
 OVERRIDES = {
     "vademecum_loader": ("library_dir", "vademecum", "state_dir"),
     "contact": ("tools", "scene", "state_dir"),
@@ -45,6 +45,7 @@ OF_LAUNCH = {
 
 
 def generate_launch_description() -> LaunchDescription:
+    """Return the launch description: one argument for each option of `avatar cell`."""
     share = FindPackageShare("avatar_ros")
     default = PathJoinSubstitution([share, "params", "planning_cell.yaml"])
     return LaunchDescription(
@@ -62,6 +63,7 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def nodes(context: LaunchContext) -> list[Node]:
+    """Return the nodes that the arguments ask for."""
     refuse_unknown(context.argv)
     values = {n: LaunchConfiguration(n).perform(context) for n in ("params", *ARGUMENTS)}
     given = {name: value for name, value in values.items() if value}
@@ -84,7 +86,7 @@ def nodes(context: LaunchContext) -> list[Node]:
 
 
 def typed(name: str, given: str) -> ParameterValue | list[str]:
-    """An argument as a parameter; launch by itself would take a folder called 2024 for a number."""
+    """Return an argument as a parameter; launch itself would take a folder 2024 for a number."""
     if name == "tools":
         return [word.strip() for word in given.split(",")]
     return ParameterValue(LaunchConfiguration(name), value_type=int if name == "port" else str)

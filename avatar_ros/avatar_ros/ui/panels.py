@@ -36,7 +36,7 @@ from avatar_ros.ui.view.view import OrganView
 
 PANEL_WIDTH = 350  # [px]; leaves 450 of 800 for the organ
 BESIDE = "tool"
-VIEWS = {**{letter: letter for letter in NAMES}, BESIDE: BESIDE}  # by button
+VIEWS = {**{letter: letter for letter in NAMES}, BESIDE: BESIDE}  # view of each button
 _CUBE = "position:fixed;left:14px;bottom:10px;z-index:5;pointer-events:none;line-height:0"
 _BANNER = (
     "position:fixed;left:14px;top:10px;max-width:52vw;z-index:6;pointer-events:none;"
@@ -48,7 +48,7 @@ _ALERT = f"padding:6px 12px;margin-bottom:6px;border-radius:4px;color:#fff;backg
 class Panels:
     """Controls and readouts of the page; each tab gets the parts of the page that it works on.
 
-    load : loads a file of the library; mark_reach : draws a pattern where tools reach, or none
+    load : loads a file of the library; mark_reach : draws or hides the pattern where tools reach
     store : takes name and content of a file that a browser sends
     """
 
@@ -109,7 +109,7 @@ class Panels:
         view.turn_to(side)
 
     def show_cube(self, client: Any, drawing: str) -> None:
-        """Show in one browser from where the organ is seen."""
+        """Show in one browser the cube with the direction of view."""
         content = f'<div style="{_CUBE}">{drawing}</div>'
         if client.client_id not in self._cubes:
             self._cubes[client.client_id] = client.gui.add_html(content)
@@ -117,7 +117,7 @@ class Panels:
             self._cubes[client.client_id].content = content
 
     def forget_client(self, client: Any) -> None:
-        """A browser has left."""
+        """Forget a browser that has left."""
         self._cubes.pop(client.client_id, None)
 
     def offer(self, found: Found) -> None:
@@ -138,7 +138,7 @@ class Panels:
         self._show_state()
 
     def say(self, text: str) -> None:
-        """Show the outcome of what was asked for."""
+        """Show the outcome of a request."""
         self._news = text
         self._show_state()
 
@@ -149,11 +149,11 @@ class Panels:
         _set(self._state, f'<div id="state" role="status" style="{_STATE}">{content}</div>')
 
     def show_numbers(self, content: str) -> None:
-        """Show the numbers of a period, as HTML of a constant height: nothing below moves."""
+        """Show the numbers of a period, as HTML of a constant height, so that the controls stay."""
         _set(self._readout, f'<div id="numbers" style="{_NUMBERS}">{content}</div>')
 
     def show_alerts(self, alerts: list[str]) -> None:
-        """Show over the picture what must not be missed."""
+        """Show alerts over the picture."""
         lines = "".join(f'<div style="{_ALERT}">⚠ {escape(text)}</div>' for text in alerts)
         _set(self._banner, f'<div id="alerts" role="alert" style="{_BANNER}">{lines}</div>')
 
@@ -167,6 +167,6 @@ _NUMBERS = "height:8.8em;overflow:hidden;margin:0 1em;font-size:14px;line-height
 
 
 def _set(handle: Any, content: str) -> None:
-    """Send HTML only if it is another."""
+    """Send HTML only if it has changed."""
     if handle.content != content:
         handle.content = content

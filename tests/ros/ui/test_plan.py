@@ -176,7 +176,7 @@ def test_a_kept_state_comes_back_with_its_view(
     assert scene == [KEPT.scene, KEPT.material, KEPT.look]
     np.testing.assert_array_equal(targets, KEPT.targets)
     plan.go_back("nothing", "browser")
-    assert len(seen) == 1 and page.of("say")[-1] == "no such state is kept of this organ"
+    assert len(seen) == 1 and page.of("say")[-1] == "this organ has no such kept state"
 
 
 def test_a_report_holds_numbers_errors_and_notes(plan: Plan, page: Noted, tmp_path: Path) -> None:

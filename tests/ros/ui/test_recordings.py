@@ -142,7 +142,7 @@ def test_a_recording_is_scrubbed_and_each_state_is_one_period(
             cube, material
         ).startswith("E 50 kPa")
         assert player.part == pytest.approx(part)
-    assert "not what the tool feels now" in player.alerts[0]
+    assert "not the present state" in player.alerts[0]
     player.close()
     assert player.state(cube) is None and player.alerts == []
     assert "another organ" in player.open("recording-1.h5", replace(cube, id="b" * 64), 1)
@@ -185,7 +185,7 @@ def test_a_recording_of_two_tools_is_played_with_both(
     of = periods(number, 2, tip=tip, force=force, status=status)
     scene = read_scene(shipped_scene("two_tools"))
     save_recording(recording(cube, of, scene), tmp_path / "recording-2.h5")
-    assert "is of 2 tools, the cell has 1" in player.open("recording-2.h5", cube, 1)
+    assert "has 2 tools, the cell 1" in player.open("recording-2.h5", cube, 1)
     assert player.open("recording-2.h5", cube, 2) == ""
     player.seek(1.0)
     played = player.state(cube)

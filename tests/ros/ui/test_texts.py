@@ -193,7 +193,7 @@ def test_a_tool_beyond_the_range_is_named_and_nothing_else_is_shown_as_of_now(
 
 def test_what_is_extrapolated_on_another_tool_is_not_missed(chooser: PeriodChooser) -> None:
     shown = drawn(chooser, rows((OK, 1.0), (ContactState.STATUS_EXTRAPOLATED, 25.0)))
-    expected = "Extrapolated: beyond what was computed; the force is a guess"
+    expected = "Extrapolated: beyond the computed range; do not rely on the force"
     assert alerts(EXACT, (), shown, NAMES) == [f"right: {expected}"]
     assert alerts(EXACT, (), [shown[1], shown[1]], NAMES) == [expected]  # of both: said once
 

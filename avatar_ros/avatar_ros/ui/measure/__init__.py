@@ -1,1 +1,1 @@
-"""Measures on the planning page: a probe, a ruler, a plane, and what is around the tool."""
+"""Measures on the planning page: a probe, a ruler, a plane, and distances around the tool."""

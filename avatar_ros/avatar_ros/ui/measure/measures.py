@@ -1,6 +1,6 @@
-"""What is measured on the planning page: a probe, a ruler, a plane, and the tool's surroundings.
+"""Measures on the planning page: a probe, a ruler, a plane, and distances around the tool.
 
-All of it belongs to the period that is drawn; places are points of the tissue and move with it.
+All of them belong to the period that is drawn; places are points of the tissue and move with it.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from avatar_ros.ui.view.measuring import Place, depth, gap, hit, is_plane, margi
 from avatar_ros.ui.view.organ import Organ
 from avatar_ros.ui.view.tip_body import tip_body, turn_to, turned
 
-TOOL = "the tool"  # is put where a click is, and nothing is measured
+TOOL = "the tool"  # a click puts the tool there, and nothing is measured
 PROBE, RULER, PLANE = "probe", "ruler (2 points)", "plane (3 points)"
 _NEEDED = {PROBE: 1, RULER: 2, PLANE: 3}
-_DOTS = {PROBE: 0, RULER: 1, PLANE: 3}  # the first of each
-_AROUND = 0.03  # distance from the organ up to which a depth is said [m]
-_N_BODY = 200  # points of a tip between which and a structure the way is measured
+_DOTS = {PROBE: 0, RULER: 1, PLANE: 3}  # first dot of each
+_AROUND = 0.03  # distance from the organ up to which a depth is shown [m]
+_N_BODY = 200  # number of points of a tip from which the gap to a structure is measured
 
 
 class Now(NamedTuple):
     """The period that is drawn.
 
-    points : ndarray, shape (n, 3), of the cloud; tip : of the chosen tool [m]
-    young : modulus in force [Pa]
+    points : ndarray, shape (n, 3), points of the cloud; tip : of the chosen tool [m]
+    young : Young's modulus in force [Pa]
     """
 
     points: np.ndarray
@@ -37,7 +37,7 @@ class Now(NamedTuple):
 
 
 class Measures:
-    """Places that a user clicked on, and what is measured there."""
+    """Places that a user clicked on, and the measures there."""
 
     def __init__(self, view: MeasuresView) -> None:
         self._view = view
@@ -45,17 +45,18 @@ class Measures:
         self._tip: Tip | None = None
         self._body = np.zeros((1, 3))
         self._places: dict[str, list[Place]] = {}
-        self.mode = TOOL  # what the next click places
-        self._compliance: float | None = None  # at the probe, as built; None without access [m/N]
+        self.mode = TOOL  # kind of place that the next click adds
+        # compliance at the probe, as built; None without access [m/N]
+        self._compliance: float | None = None
 
     def show_organ(self, organ: Organ, tip: Tip) -> None:
-        """Another organ: nothing was measured there yet."""
+        """Start with another organ, without places."""
         self._organ = organ
         self.change_tip(tip)
         self.clear()
 
     def change_tip(self, tip: Tip) -> None:
-        """The tip whose distance from structures is measured."""
+        """Set the tip whose distance from structures is measured."""
         if tip == self._tip:
             return
         self._tip, body = tip, tip_body(tip)[0]
@@ -67,7 +68,7 @@ class Measures:
         self._draw(None)
 
     def click(self, place: Place, points: np.ndarray) -> str:
-        """Measure at a place of the tissue, too; returns what is to be done next.
+        """Add a place of the tissue to the measure; return what to do next.
 
         points : ndarray, shape (n, 3), of the cloud that is drawn [m]
         """
@@ -108,7 +109,7 @@ class Measures:
             self._compliance = _compliance(organ, place)
 
     def lines(self, now: Now) -> list[str]:
-        """Draw, and say in a line each, what is measured in a period."""
+        """Draw the measures of a period, and return a line for each."""
         organ = self._organ
         if organ is None or len(now.points) != len(organ.vertices):
             return []
@@ -167,7 +168,7 @@ class Measures:
 
 
 def _compliance(organ: Organ, place: Place) -> float | None:
-    """Along the normal, as built [m/N]; None where no tool reaches."""
+    """Return the compliance along the normal, as built [m/N]; None where no tool reaches."""
     at = place.at(organ.vertices)
     try:
         normal = organ.vademecum.surface.nearest(at).normal

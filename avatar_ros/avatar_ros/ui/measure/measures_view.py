@@ -1,4 +1,4 @@
-"""Probe, ruler, plane and shortest way as the planning page draws them."""
+"""Probe, ruler, plane and shortest gap as the planning page draws them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from avatar_ros.ui.view import tone
 from avatar_ros.ui.view.measuring import normal_of
 
 _BLUE, _BLACK, _GREEN = (0, 114, 178), (20, 20, 20), (0, 158, 115)
-_ANCHORS: dict[str, Any] = {"ruler": "center-right", "gap": "top-left"}  # of numbers
+_ANCHORS: dict[str, Any] = {"ruler": "center-right", "gap": "top-left"}  # anchors of numbers
 _DOT = 0.002  # radius [m]
-_UNSEEN = 1e-5  # change that nobody sees [m]
+_UNSEEN = 1e-5  # smallest visible change [m]
 _PLANE_OPACITY = 0.35
 _TWO = np.array([[0, 1, 2], [0, 2, 3]])
 _NOWHERE = np.zeros((1, 2, 3), np.float32)
@@ -24,7 +24,7 @@ _NOWHERE = np.zeros((1, 2, 3), np.float32)
 class MeasuresView:
     """Dots, lines and the plane; all hidden until they are placed.
 
-    on_drag : gets which dot a user drags, and origin [m] and direction of the ray to it
+    on_drag : called with the dot that a user drags, and origin [m] and direction of the ray to it
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class MeasuresView:
         )
 
     def dots(self, first: int, places: list[np.ndarray], n: int) -> None:
-        """Show the dots ``first`` to ``first + n - 1`` at some places [m], the others not."""
+        """Show the dots ``first`` to ``first + n - 1`` at places [m]; hide those without one."""
         for i in range(n):
             dot = self._dots[first + i]
             _set(dot, "visible", i < len(places))

@@ -1,4 +1,4 @@
-"""A patient before it is built: labels of its file, its clamp drawn and painted, and the build."""
+"""A patient before the build: labels of its file, its clamp drawn and painted, and the build."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from avatar_ros.ui.patient.preview_view import BRUSHES, PreviewView
 from avatar_ros.ui.session.requests import Requests, Wanted
 from avatar_ros.ui.view.measuring import hit
 
-_PIECES = 4  # a painted face is written as the centroids of this number squared of triangles
+_PIECES = 4  # pieces along an edge; a painted face is written as the centroids of their square
 
 
 @dataclass(frozen=True)
 class Preview:
-    """The surface of a patient's mesh, and which region each face belongs to.
+    """The surface of a patient's mesh, and the region of each face.
 
-    wanted : what it is a preview of
+    wanted : request that it previews
     points : ndarray, shape (n, 3) [m]; faces : (m, 3)
     regions : ndarray of uint8, shape (m,)
     missed : points [m] and faces of parts of the organ that the surface does not reach
-    is_painted : the regions are not the template's
+    is_painted : whether the regions differ from the template's
     """
 
     wanted: Wanted
@@ -47,16 +47,16 @@ class Preview:
     is_painted: bool = False
 
     def painted(self, place: np.ndarray, radius: float, region: int) -> Preview:
-        """With the faces around a place [m] in another region."""
+        """Return a preview with the faces around a place [m] in another region."""
         away = np.linalg.norm(self.points[self.faces].mean(axis=1) - place, axis=1)
         regions = np.where(away < radius, region, self.regions).astype(np.uint8)
         return replace(self, regions=regions, is_painted=True)
 
     @property
     def named(self) -> dict[str, int]:
-        """Regions by their names in a file of groups: clamp, access, and supports by their own.
+        """Return the region numbers by name in a file of groups: clamp, access, and each spring.
 
-        Springs are numbered by their place in the request; what is clamped belongs to the clamp.
+        Springs are numbered by their place in the request; clamped supports belong to the clamp.
         """
         found = {"clamped": CLAMPED, "accessible": ACCESSIBLE}
         for k, text in enumerate(self.wanted.supports):
@@ -66,7 +66,7 @@ class Preview:
 
     @property
     def springs(self) -> dict[str, float]:
-        """Area of each of the springs [m^2], by name."""
+        """Return the area of each of the springs [m^2], by name."""
         a, b, c = self.points[self.faces].swapaxes(0, 1).astype(float)
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
         return {
@@ -76,7 +76,7 @@ class Preview:
         }
 
     def groups(self) -> dict[str, np.ndarray]:
-        """Points all over the faces of each region, by name, as a file of groups has them."""
+        """Return points all over each region's faces, by name, as a file of groups holds them."""
         within = barycentric_centroids(_PIECES)
         places = np.einsum("qk,fkd->fqd", within, self.points[self.faces].astype(float))
         return {
@@ -85,7 +85,7 @@ class Preview:
         }
 
     def is_of(self, wanted: Wanted) -> bool:
-        """Whether it shows the organ of a request, however exactly or firmly that asks for it."""
+        """Return whether it shows the organ of a request; accuracy and stiffness may differ."""
         same = ("surface", "unit", "axes", "label", "inside")
         return all(getattr(self.wanted, name) == getattr(wanted, name) for name in same) and (
             bool(self.wanted.supports) == bool(wanted.supports)
@@ -93,11 +93,11 @@ class Preview:
 
 
 class NewPatient:
-    """What the tab of a new patient does.
+    """Functions of the tab of a new patient.
 
-    folder : of the library, where painted regions are written
+    folder : folder of the library, where painted regions are written
     tab : gives the tab, which shows labels and progress (:mod:`avatar_ros.ui.tabs.patient`)
-    built : hears of the file of a patient that was built
+    built : called with the file of a patient that was built
     say : reports the outcome in a line
     """
 
@@ -118,7 +118,7 @@ class NewPatient:
         self._brush = ("nothing", 0.01)
 
     def choose_surface(self, surface: str) -> None:
-        """Offer the labels of a file, if it holds any; returns at once."""
+        """Offer the labels of a file, if it holds any; return at once."""
         self._surface = surface
         Thread(target=self._offer_labels, args=[surface], daemon=True).start()
 
@@ -130,7 +130,7 @@ class NewPatient:
                 labels = self._reader.read(surface, MAX_VOXEL_BYTES, labels_of, path)
             except AvatarError as error:
                 self._say(str(error))
-        if surface == self._surface:  # no other was chosen meanwhile
+        if surface == self._surface:  # no other surface was chosen meanwhile
             self._tab().offer_labels(labels)
 
     def build(self, wanted: Wanted) -> None:
@@ -150,7 +150,7 @@ class NewPatient:
                 tab.end(f"built in {spent:.0f} s", result.file)
                 self._built(result.file)
 
-        self._say("")  # nothing of the last build stays
+        self._say("")  # clears the message of the last build
         try:
             wanted = wanted if wanted.preview else self._with_groups(wanted)
         except AvatarError as error:
@@ -166,11 +166,11 @@ class NewPatient:
         self._requests.build_patient(wanted, *tell)
 
     def cancel(self) -> None:
-        """Cancel the build that is under way, if any."""
+        """Cancel the running build, if any."""
         self._requests.cancel_patient()
 
     def _with_groups(self, wanted: Wanted) -> Wanted:
-        """With the file of the regions that were painted on a preview of the same organ."""
+        """Return the request with the file of regions painted on a preview of the same organ."""
         preview = self._preview
         if preview is None or not preview.is_painted or not preview.is_of(wanted):
             return wanted
@@ -185,6 +185,7 @@ class NewPatient:
 
     @property
     def is_previewing(self) -> bool:
+        """Return whether a preview is shown."""
         return self._preview is not None
 
     def _show(self, preview: Preview) -> None:
@@ -200,17 +201,17 @@ class NewPatient:
             self._tab().show_preview(False)
 
     def alerts(self, in_use: str) -> list[str]:
-        """What must not be missed while a preview is shown."""
+        """Return the alerts while a preview is shown."""
         if self._preview is None:
             return []
         painted = ", as painted" if self._preview.is_painted else ""
         return [
-            f"Preview of {self._preview.wanted.surface}: what would be held{painted}. "
-            f"Nothing is solved; forces and numbers are those of {in_use}, which is hidden"
+            f"Preview of {self._preview.wanted.surface}: the regions that would be held{painted}. "
+            f"Nothing is solved; forces and numbers belong to {in_use}, which is hidden"
         ]
 
     def brush(self, name: str, radius: float) -> None:
-        """Choose what a click paints, in a radius [m]: one of ``BRUSHES``, or springs by name."""
+        """Choose the region that clicks paint within a radius [m]: of ``BRUSHES``, or a spring."""
         self._brush = name, radius
 
     def paint(self, origin: np.ndarray, direction: np.ndarray) -> None:
@@ -218,7 +219,8 @@ class NewPatient:
         preview, (name, radius) = self._preview, self._brush
         if preview is None:
             return
-        region = (BRUSHES | preview.named).get(name)  # of this preview: numbers are by request
+        # of this preview: numbers depend on the request
+        region = (BRUSHES | preview.named).get(name)
         if region is None:
             return
         place = hit(origin, direction, preview.points, preview.faces)

@@ -1,4 +1,4 @@
-"""A patient's surface before anything is solved, with the patterns of clamp and access."""
+"""A patient's surface before the solve, with the patterns of clamp and access."""
 
 from __future__ import annotations
 

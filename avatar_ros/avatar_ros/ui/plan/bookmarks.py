@@ -1,7 +1,7 @@
 """States of the planning page that a user keeps: poses, scene, material and view, with a note.
 
-They lie in a file of the library, ``plan-ID.json`` for each vademecum, by its id: a state is worth
-nothing on another organ.
+They lie in a file of the library, ``plan-ID.json`` for each vademecum, by its id: a state cannot be
+used on another organ.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ _VERSION = 2
 class Bookmark:
     """A kept state.
 
-    note : of the user; made : local time, ISO 8601
-    targets : of each tool's tip [m]; scene : its name, empty for natural effects
+    note : note of the user; made : local time, ISO 8601
+    targets : position of each tool's tip [m]; scene : its name, empty for natural effects
     material : values by coordinate [SI]
-    camera : position, what is looked at, what is up, nine numbers [m]; empty without a browser
+    camera : position, point looked at, up direction, nine numbers [m]; empty without a browser
     look : whole, glass or cut open; side, part : of the cut
-    lines : numbers as shown then, after what must not be missed
+    lines : alerts and numbers as shown then
     picture : PNG, base64; empty if the browser gave none
     scale : name of the picture's colour scale with its unit, and its end in that unit; None if
         it is not known
@@ -59,21 +59,21 @@ class Bookmark:
         if len(self.camera) not in (0, 9):
             raise ValueError("a camera has nine numbers")
         if look not in LOOKS or side not in AXES or not 0.0 <= part <= 1.0:
-            raise ValueError("an organ is not shown so")
+            raise ValueError("the look is unknown")
         if self.scale is not None:
             what, top = self.scale
             if what not in (DISPLACEMENT, EXPECTED_ERROR, SPREAD) or not 0.0 < top < math.inf:
-                raise ValueError("there is no such colour scale")
+                raise ValueError("the colour scale is unknown")
         base64.b64decode(self.picture, validate=True)
 
     @property
     def label(self) -> str:
-        """To choose it by."""
+        """Return the name in the list of kept states."""
         return f"{self.made[5:19].replace('T', ' ')} {self.note}".strip()
 
 
 class Bookmarks:
-    """Those of one organ, oldest first."""
+    """Kept states of one organ, oldest first."""
 
     def __init__(self, folder: Path, identity: str, name: str) -> None:
         self.path = folder / f"plan-{identity[:_ID]}.json"
@@ -81,19 +81,19 @@ class Bookmarks:
         self.kept: list[Bookmark] = _read(self.path, identity) if self.path.is_file() else []
 
     def keep(self, bookmark: Bookmark) -> None:
-        """Add one, and write the file."""
+        """Add a state, and write the file."""
         self.kept.append(bookmark)
         self._write()
 
     def drop(self, label: str) -> None:
-        """Remove one, and write the file."""
+        """Remove a state, and write the file."""
         found = self.find(label)
         if found is not None:
             self.kept.remove(found)
             self._write()
 
     def find(self, label: str) -> Bookmark | None:
-        """The newest of a label."""
+        """Return the newest state of a label."""
         return next((b for b in reversed(self.kept) if b.label == label), None)
 
     def _write(self) -> None:
@@ -108,19 +108,19 @@ class Bookmarks:
 
 
 def _read(path: Path, identity: str) -> list[Bookmark]:
-    """Those of a file, each checked, since anybody may have written it.
+    """Read the states of a file and check each, since anybody may have written it.
 
     Raises
     ------
     StorageError
-        For a file that is none, or is of another vademecum.
+        If the file is damaged, or belongs to another vademecum.
     """
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise ValueError(f"more than {_MOST_BYTES >> 20} MB")
         whole = json.loads(path.read_text())
         if whole["version"] != _VERSION or whole["vademecum_id"] != identity:
-            raise ValueError("of another version or vademecum")
+            raise ValueError("it was written for another version or vademecum")
         return [of_plain(Bookmark, state, "states") for state in whole["states"]]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, StorageError) as error:
         raise StorageError(

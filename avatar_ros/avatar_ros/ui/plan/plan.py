@@ -41,19 +41,19 @@ def _pdf(organ: Organ, kept: Sequence[Bookmark], alerts: Sequence[str]) -> bytes
 REPORTS = {".html": _html, ".pdf": _pdf}
 _PICTURE = (1200, 1600)  # height and width [px]: 235 dots per inch on A4
 _LONGEST_NAME = 40  # letters of an organ's name in that of a file
-_PATIENCE = 20.0  # with a browser that draws a picture [s]
+_PATIENCE = 20.0  # time for a browser to draw a picture [s]
 
 Restore = Callable[[str, dict[str, float], tuple[str, str, float], np.ndarray], None]
 
 
 @dataclass(frozen=True)
 class PlanNow:
-    """What is shown at the moment of a request; as in :class:`Bookmark`.
+    """State of the page at the moment of a request; other fields as in :class:`Bookmark`.
 
-    alerts : what must not be missed of the numbers
-    points : ndarray, shape (n, 3), of the cloud [m]
+    alerts : alerts on the numbers
+    points : ndarray, shape (n, 3), points of the cloud [m]
     scale : name of the colour scale with its unit, and its end in that unit
-    not_now : why what is shown is no state of now to return to; empty if it is
+    not_now : why the picture is not the present state; empty if it is
     given : coordinates of the material that somebody chose
     """
 
@@ -73,9 +73,9 @@ class PlanNow:
 class Plan:
     """The kept states of the organ that is shown.
 
-    now : what is shown, None without an organ
+    now : returns the present state, None without an organ
     restore : returns to scene, material, look and targets of a kept state
-    offer : shows the labels of what is kept
+    offer : shows the labels of the kept states
     say : reports the outcome in a line
     """
 
@@ -92,7 +92,7 @@ class Plan:
         self._bookmarks: Bookmarks | None = None
 
     def show_organ(self, organ: Organ) -> None:
-        """The states of another organ; a file that is none is left alone and said."""
+        """Read the states of another organ; report a damaged file, and leave it alone."""
         self._bookmarks = None
         try:
             self._bookmarks = Bookmarks(self._folder, organ.id, organ.name)
@@ -105,7 +105,7 @@ class Plan:
         self._offer([bookmark.label for bookmark in kept])
 
     def keep(self, note: str, client: Any) -> None:
-        """Keep what is shown, as one browser sees it."""
+        """Keep the present state, as one browser sees it."""
         now, bookmarks = self._now(), self._bookmarks
         if now is None or bookmarks is None:
             self._say("nothing to keep yet: choose an organ first")
@@ -128,7 +128,7 @@ class Plan:
             picture=_picture(client),
             scale=now.scale,
         )
-        if bookmarks is not self._bookmarks:  # a picture takes its time
+        if bookmarks is not self._bookmarks:  # drawing the picture takes time
             self._say("not kept: another organ was loaded meanwhile")
             return
         self._try(lambda: bookmarks.keep(bookmark), f"kept in {bookmarks.path.name}")
@@ -145,7 +145,7 @@ class Plan:
         """Return to a kept state."""
         found = self._bookmarks.find(label) if self._bookmarks else None
         if found is None:
-            self._say("no such state is kept of this organ")
+            self._say("this organ has no such kept state")
             return
         self._restore(found.scene, found.material, found.look, np.array(found.targets))
         if client is not None and found.camera:
@@ -189,7 +189,7 @@ class Plan:
         now = self._now()
         how, side, part = now.look if now else ("", "A", 0.0)
         if now is None or how != CUT:
-            self._say("no plane cuts the organ: choose 'cut open' under Organ, and put it there")
+            self._say("no plane cuts the organ: choose 'cut open' under Organ, and place the plane")
             return
         path = _new_file(self._folder, "resection", now.organ, ".json")
         normal = np.array(AXES[side])
@@ -219,7 +219,7 @@ def _counted(n: int) -> str:
 
 
 def _new_file(folder: Path, kind: str, organ: Organ, suffix: str) -> Path:
-    """A file that is not there yet, e.g. ``report-Patient_7-20261128-213000.pdf``."""
+    """Return the path of a new file, e.g. ``report-Patient_7-20261128-213000.pdf``."""
     name = re.sub(r"[^\w.-]+", "_", organ.name)[:_LONGEST_NAME]
     stem = f"{kind}-{name}-{time.strftime('%Y%m%d-%H%M%S')}"
     names = (f"{stem}{f'-{k}' if k > 1 else ''}{suffix}" for k in count(1))
@@ -227,14 +227,14 @@ def _new_file(folder: Path, kind: str, organ: Organ, suffix: str) -> Path:
 
 
 def _picture(client: Any) -> str:
-    """What a browser shows, as PNG in base64; empty if it gives none in time."""
+    """Return a browser's picture as PNG in base64; empty if none comes in time."""
     if client is None:
         return ""
     from PIL import Image
 
     try:
         pixels = client.get_render(*_PICTURE, transport_format="png", timeout=_PATIENCE)
-    except Exception:  # viser's own errors, of a browser that left or draws too slowly
+    except Exception:  # viser's own errors, if a browser left or draws too slowly
         return ""
     file = BytesIO()
     Image.fromarray(pixels).save(file, "PNG")

@@ -1,4 +1,4 @@
-"""The kept states of an organ on one page of HTML, with pictures and numbers, for the file."""
+"""Report of an organ's kept states on one page of HTML, with pictures and numbers."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ DISCLAIMER = (
 
 
 def report(organ: Organ, kept: Sequence[Bookmark], alerts: Sequence[str]) -> str:
-    """The page.
+    """Return the page.
 
-    alerts : what must not be missed about the organ, as on the planning page
+    alerts : alerts on the organ, as on the planning page
     """
     table = "".join(
         f"<tr><th>{key}</th><td>{escape(value)}</td></tr>" for key, value in rows_of(organ).items()
@@ -45,7 +45,7 @@ def report(organ: Organ, kept: Sequence[Bookmark], alerts: Sequence[str]) -> str
 
 
 def rows_of(organ: Organ) -> dict[str, str]:
-    """What a report says of the organ itself."""
+    """Return the rows of a report about the organ itself."""
     info = organ.info
     return {
         "organ": organ.name,
@@ -58,16 +58,16 @@ def rows_of(organ: Organ) -> dict[str, str]:
 
 
 def fingerprint(organ: Organ) -> str:
-    """Tells this vademecum from every other, in small print."""
+    """Return the line in small print that identifies this vademecum."""
     return f"Vademecum: SHA-256 {organ.id}"
 
 
 def _errors(mean: float, worst: float) -> str:
-    return f"{mean:.1%} in the mean, {worst:.1%} at worst" if mean == mean else "never measured"
+    return f"{mean:.1%} on average, {worst:.1%} at worst" if mean == mean else "never measured"
 
 
 def lines_of(kept: Bookmark) -> list[str]:
-    """What a report says of a kept state."""
+    """Return the lines of a report about a kept state."""
     places = (", ".join(f"{1e3 * value:.1f}" for value in target) for target in kept.targets)
     scene = kept.scene or "natural effects"
     tips = "Tip" if len(kept.targets) == 1 else "Tips"
@@ -78,7 +78,7 @@ def lines_of(kept: Bookmark) -> list[str]:
 
 
 def opacity_of(kept: Bookmark) -> float:
-    """Opacity of organ and colour scale: both look alike before the same ground."""
+    """Return the opacity of organ and colour scale: both look alike on the same background."""
     return OPACITY_OF_GLASS if kept.look[0] == GLASS else 1.0
 
 

@@ -1,4 +1,4 @@
-"""The kept states of an organ as a PDF: a page for the organ, and one for each state."""
+"""Report of an organ's kept states as a PDF: a page for the organ, and one for each state."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from avatar_ros.ui.view.colours import N_BANDS, band_colours, scale_colours
 from avatar_ros.ui.view.legend import DISPLACEMENT
 from avatar_ros.ui.view.organ import Organ
 
-_A4, _DPI = (8.27, 11.69), 240  # [in]; dots per inch of pictures, which have no more
-_LEFT, _TOP, _LINE, _WIDTH = 0.09, 0.93, 0.022, 88  # parts of a page, and letters of a line
-_BROAD = 0.82  # a picture, of the page
+_A4, _DPI = (8.27, 11.69), 240  # [in]; dots per inch, as many as the pictures have
+_LEFT, _TOP, _LINE, _WIDTH = 0.09, 0.93, 0.022, 88  # fractions of a page, and letters of a line
+_BROAD = 0.82  # width of a picture, as a fraction of the page
 _ALERT = "#b3261e"
 
 
 def report_pdf(organ: Organ, kept: Sequence[Bookmark], alerts: Sequence[str]) -> bytes:
-    """The file; parameters as of :func:`avatar_ros.ui.plan.report.report`."""
+    """Return the file; parameters as of :func:`avatar_ros.ui.plan.report.report`."""
     file = io.BytesIO()
     title = f"Plan of {organ.name}, {time.strftime('%Y-%m-%d %H:%M')}"
     with PdfPages(file, metadata={"Title": title, "Creator": "avatar"}) as pages:
@@ -44,7 +44,7 @@ def report_pdf(organ: Organ, kept: Sequence[Bookmark], alerts: Sequence[str]) ->
 
 
 def _page(title: str, organ: Organ) -> Figure:
-    """A page with its title, and at its end what each page says."""
+    """Return a page with its title, and at its end the line that each page has."""
     page = Figure(_A4, _DPI)
     page.text(_LEFT, _TOP, title, size=15, weight="bold", wrap=True, parse_math=False)
     for text, height, size in ((DISCLAIMER, 0.06, 8), (fingerprint(organ), 0.04, 6)):
@@ -53,7 +53,7 @@ def _page(title: str, organ: Organ) -> Figure:
 
 
 def _write(page: Figure, height: float, lines: Sequence[str], marked: Sequence[str] = ()) -> None:
-    """Write lines from a height on downwards, first those that are marked."""
+    """Write lines downwards from a height, the marked ones first."""
     for text, colour in [*((t, _ALERT) for t in marked), *((t, "black") for t in lines)]:
         for line in textwrap.wrap(text, _WIDTH) or [""]:
             page.text(_LEFT, height, line, size=10, color=colour, parse_math=False)
@@ -61,7 +61,7 @@ def _write(page: Figure, height: float, lines: Sequence[str], marked: Sequence[s
 
 
 def _draw(page: Figure, height: float, state: Bookmark) -> float:
-    """Draw the picture of a state with its colour bar, and return the height below them."""
+    """Draw the picture of a state with its colour bar; return the height below them."""
     image = Image.open(io.BytesIO(base64.b64decode(state.picture)))
     height -= _BROAD * image.height / image.width * _A4[0] / _A4[1]
     axes = page.add_axes((_LEFT, height, _BROAD, _TOP - 2.0 * _LINE - height))

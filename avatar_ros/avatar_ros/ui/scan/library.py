@@ -13,14 +13,14 @@ from avatar_core.geometry.surface_formats import SUFFIXES
 from avatar_core.vademecum.storage import FORMAT, MAX_FILE_BYTES, load_vademecum
 from avatar_ros.framework.reader import Reader
 
-RECORDINGS = "recording-*.h5"  # names of these files
+RECORDINGS = "recording-*.h5"  # name pattern of these files
 IMAGE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".dcm")
 
 
 class Found(NamedTuple):
-    """Names of files, sorted; a folder with a series of DICOM has a stroke at the end.
+    """Names of files, sorted; a folder with a series of DICOM has a slash at the end.
 
-    damaged : a line for each file that is named as a vademecum, with why it is not offered
+    damaged : a line for each file named as a vademecum that is not offered, with the reason
     """
 
     vademecums: list[str]
@@ -31,18 +31,19 @@ class Found(NamedTuple):
 
 
 class Library:
-    """A folder that is listed from time to time; what has not changed is not opened again."""
+    """A folder that is listed from time to time; unchanged files are not opened again."""
 
     def __init__(self, folder: Path, reader: Reader) -> None:
         self.folder, self._reader = folder, reader
         self._known: dict[tuple[str, int], bool | str] = {}
 
     def offer(self) -> Found:
-        """Files to choose from now.
+        """Return the files to choose from now.
 
         Raises
         ------
-        OSError : the folder is gone, as a share that is not mounted any more
+        OSError
+            If the folder is gone, e.g. because it is no longer mounted.
         """
         found = sorted(p for p in self.folder.iterdir() if not p.name.startswith("."))
         files = [path for path in found if path.is_file()]
@@ -59,7 +60,7 @@ class Library:
         )
 
     def _is_vademecum(self, path: Path) -> bool | str:
-        """Whether a file is one, or why it is none of ours."""
+        """Return whether a file is a vademecum, or why it cannot be used."""
         try:
             return self._reader.read(path.name, 0, is_vademecum, path)
         except AvatarError as error:
@@ -68,7 +69,7 @@ class Library:
     def _is(self, kind: Callable[[Path], bool | str], path: Path) -> bool | str:
         try:
             key = (path.name, path.stat().st_mtime_ns)
-        except FileNotFoundError:  # removed just now
+        except FileNotFoundError:  # just removed
             return False
         if key not in self._known:
             self._known[key] = kind(path)
@@ -76,11 +77,11 @@ class Library:
 
 
 def is_vademecum(path: Path) -> bool:
-    """Whether an HDF5 file is a vademecum, by its head, and no recording or atlas.
+    """Return whether an HDF5 file is a vademecum, by its head, and no recording or atlas.
 
     Raises StorageError for a file that is damaged or of another program.
     """
     kind = format_of(path, MAX_FILE_BYTES)
     if kind is None:
-        load_vademecum(path)  # says why
+        load_vademecum(path)  # raises with the reason
     return kind == FORMAT

@@ -1,6 +1,6 @@
-"""An image, as of CT or MR, in three planes along its voxels, in grey by window and level.
+"""An image such as CT or MR in three planes along its voxels, in grey by window and level.
 
-It stays as it was taken: nothing of it is deformed with the organ.
+It stays as it was acquired: it is not deformed with the organ.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from scipy.optimize import linear_sum_assignment
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.label_files import read_image
 
-MOST = 256  # voxels that are kept along an axis, evenly
-_AIR = -500.0  # an image that goes below is CT in Hounsfield units
+MOST = 256  # voxels that are kept along an axis, evenly spaced
+_AIR = -500.0  # an image with lower values is CT in Hounsfield units
 _CT = (40.0, 400.0)  # level and window of soft tissue
 _SHEAR = 1e-2  # cosine between two axes of voxels, above which planes are no rectangles
-_NAMES = ("sagittal", "coronal", "axial")  # planes square to R, A and S
+_NAMES = ("sagittal", "coronal", "axial")  # names of planes square to R, A and S
 
 
 class Scan(NamedTuple):
-    """Voxels and where they lie.
+    """Voxels and their position.
 
     values : ndarray, shape (nx, ny, nz)
     affine : ndarray, shape (4, 4), from indices to RAS [m]
     level, window : middle and width of the grey scale at first, in units of the values
-    low, high : of all values
-    notices : what its file leaves open or contradicts, one line each
+    low, high : smallest and largest value
+    notices : omissions and contradictions of its file, one line each
     """
 
     values: np.ndarray
@@ -41,8 +41,7 @@ class Scan(NamedTuple):
 
     @property
     def planes(self) -> tuple[str, ...]:
-        """Name of the planes square to each axis of the voxels, each name once: the nearest of the
-        patient's."""
+        """Name the planes square to the voxels' axes, each name once, by the nearest of R, A, S."""
         axes = np.abs(self.affine[:3, :3]) / np.linalg.norm(self.affine[:3, :3], axis=0)
         return tuple(_NAMES[k] for k in linear_sum_assignment(axes.T, maximize=True)[1])
 
@@ -52,8 +51,8 @@ class Slice(NamedTuple):
 
     grey : ndarray of uint8, shape (rows, columns)
     middle : ndarray, shape (3,) [m]
-    turn : ndarray, shape (3, 3), along columns, along rows and their normal
-    width, height : [m]
+    turn : ndarray, shape (3, 3), directions along columns, along rows and of the normal
+    width, height : extent [m]
     """
 
     grey: np.ndarray
@@ -64,9 +63,9 @@ class Slice(NamedTuple):
 
 
 def read_scan(path: str | Path) -> Scan:
-    """The image of a NIfTI, NRRD or DICOM file, or of a folder with a series of DICOM.
+    """Read the image of a NIfTI, NRRD or DICOM file, or of a folder with a series of DICOM.
 
-    Raises SurfaceError of a file that is none, holds several images, or whose axes are sheared.
+    Raises SurfaceError for a file that is none, holds several images, or whose axes are sheared.
     """
     path = Path(path)
     image = read_image(path)
@@ -91,9 +90,9 @@ def read_scan(path: str | Path) -> Scan:
 
 
 def slice_of(scan: Scan, axis: int, part: float, level: float, window: float) -> Slice:
-    """The plane square to an axis of the voxels, at a part of the way along it.
+    """Return the plane square to an axis of the voxels, at a part of the way along it.
 
-    level, window : middle and width of what is between black and white
+    level, window : middle and width of the range from black to white
     """
     n = scan.values.shape[axis]
     k = min(int(part * n), n - 1)

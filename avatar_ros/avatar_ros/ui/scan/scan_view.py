@@ -1,6 +1,7 @@
-"""An image in three planes: which file, where the planes lie, and how they are drawn.
+"""View of an image in three planes: its file, the position of the planes, and their drawing.
 
-The image stays as it was taken. Lines show where its planes cut the organ and what is in it now.
+The image stays as it was acquired. Lines show where its planes now cut the organ and structures in
+it.
 """
 
 from __future__ import annotations
@@ -21,17 +22,18 @@ from avatar_ros.ui.view.organ import Organ
 from avatar_ros.ui.view.structures_view import STRUCTURE
 from avatar_ros.ui.view.surface_view import section
 
-SEEN_FROM = {"axial": "I", "coronal": "A", "sagittal": "L"}  # by radiologists
+SEEN_FROM = {"axial": "I", "coronal": "A", "sagittal": "L"}  # side from which radiologists look
 _MIDDLE = 0.5
 ORGAN_LINE = (86, 180, 233)  # sky blue of Okabe and Ito, distinguishable on grey
 _LINE_WIDTH = 2.0  # [px]
-_IN_FRONT = 0.3e-3  # of the plane, on both sides, so that it does not hide its lines [m]
+# distance of lines from the plane, on both sides, so that it does not hide them [m]
+_IN_FRONT = 0.3e-3
 
 
 class ScanView:
     """Draws three planes into a viser server.
 
-    folder : of the library; show : shows the controls of an image, of a file, or none
+    folder : folder of the library; show : shows the controls of a file's image, or none
     say : reports in a line; turn_to : turns the cameras to a side of the patient, as "A"
     """
 
@@ -47,12 +49,12 @@ class ScanView:
         self._server, self._folder, self._reader = server, folder, reader
         self._show, self._say, self._turn_to = show, say, turn_to
         self._scan: Scan | None = None
-        self._file = ""  # that was asked for last
+        self._file = ""  # the file that was requested last
         self._parts = [_MIDDLE] * 3
-        self._alone: int | None = None  # axis of the one plane that is seen; None: all
+        self._alone: int | None = None  # axis of the only visible plane; None: all
         self._grey = (0.0, 1.0)
         self._planes: list[Any] = []
-        self._slices: list[Slice] = []  # that are drawn
+        self._slices: list[Slice] = []  # planes that are drawn
         self._lines: dict[int, Any] = {}
         self._cut: tuple[np.ndarray, list[Slice]] | None = None  # points and planes of the lines
 
@@ -66,7 +68,7 @@ class ScanView:
         except AvatarError as error:
             self._say(str(error))
             scan = None
-        if file != self._file:  # another was chosen meanwhile, or another organ has come
+        if file != self._file:  # another image was chosen meanwhile, or another organ has come
             return
         if scan is None:
             self._clear("")
@@ -77,7 +79,7 @@ class ScanView:
         self._draw(range(3))
 
     def forget(self) -> None:
-        """Another organ is shown. Of the thread that draws the organ, as ``follow``."""
+        """Remove the image of another organ; called in the thread that draws, as ``follow``."""
         self._clear("")
         self._remove_lines()
 
@@ -91,10 +93,10 @@ class ScanView:
 
     @property
     def alerts(self) -> list[str]:
-        """What must not be missed while planes are drawn."""
+        """Return the alerts while planes are drawn."""
         if self._scan is None:
             return []
-        said = ("check that it is of this patient; it does not move", *self._scan.notices)
+        said = ("check that it is of this patient; it is not deformed", *self._scan.notices)
         return [f"Image {self._file}: {one}" for one in said]
 
     def follow(self, organ: Organ, points: np.ndarray) -> None:
@@ -145,7 +147,7 @@ class ScanView:
         self._draw([axis])
 
     def see(self, axis: int | None) -> None:
-        """Show one plane alone, from the side from which radiologists see it, or all again."""
+        """Show one plane alone, from the side from which radiologists look, or all again."""
         scan, self._alone = self._scan, axis
         for number, plane in enumerate(self._planes):
             plane.visible = axis in (None, number)
@@ -186,7 +188,7 @@ class ScanView:
 
 
 def _cuts(points: np.ndarray, faces: np.ndarray, slices: list[Slice]) -> np.ndarray:
-    """Where planes cut triangles, on both sides of each plane; shape (m, 2, 3) [m]."""
+    """Return where planes cut triangles, on both sides of each plane, shape (m, 2, 3) [m]."""
     found = []
     for one in slices:
         normal = one.turn[:, 2]

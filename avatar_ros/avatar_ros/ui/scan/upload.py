@@ -1,4 +1,4 @@
-"""Files that a browser sends into the library: bounded, checked as any other, never overwriting."""
+"""Files that a browser sends into the library: limited in size, checked, never overwriting."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from avatar_ros.ui.server.index_page import MOST_SENT
 def receive(
     folder: Path, reader: Reader, say: Callable[[str], None], name: str, content: bytes
 ) -> None:
-    """Store a file, and report in a line that it is checked and what came of it."""
+    """Store a file; report in a line that it is checked, and the outcome."""
     say(f"checking {name} ...")
     try:
         store(folder, reader, name, content)
@@ -37,9 +37,10 @@ def receive(
 
 
 def store(folder: Path, reader: Reader, name: str, content: bytes) -> None:
-    """Write a file into the library, if it is one that the page can use.
+    """Write a file into the library, if the page can use it.
 
-    Raises AvatarError, with nothing left behind, for a name that is none or is taken, and for a
+    Raises AvatarError, with nothing left behind, for a name that is no file's or is taken, and for
+    a
     file that cannot be read.
     """
     file_name(name)  # refuses a path
@@ -54,7 +55,7 @@ def store(folder: Path, reader: Reader, name: str, content: bytes) -> None:
             sent = Path(own) / name
             sent.write_bytes(content)
             reader.read(name, len(content), check, sent)
-            with path.open("xb"):  # fails if another one came meanwhile
+            with path.open("xb"):  # fails if another file came meanwhile
                 os.replace(sent, path)
     except FileExistsError as error:
         raise _taken(name) from error
@@ -69,11 +70,11 @@ def check(path: Path) -> None:
     if path.suffix == ".h5":
         (load_recording if path.match(RECORDINGS) else load_vademecum)(path)
     elif path.name.lower().endswith(MESHES):
-        read_surface(path, check_size=False)  # whose unit is given with a build
+        read_surface(path, check_size=False)  # its unit is given with a build
     else:
         try:
             read_image(path)
-        except SurfaceError:  # as a segmentation of several layers
+        except SurfaceError:  # e.g. a segmentation of several layers
             read_label_map(path)
 
 
@@ -82,14 +83,14 @@ def _taken(name: str) -> RefusedError:
 
 
 def take(button: Any) -> tuple[str, bytes]:
-    """Name and content of what was sent by a button, which keeps it no longer."""
+    """Take name and content of a sent file from a button, which then forgets it."""
     sent: UploadedFile = button.value
     button._impl.value = UploadedFile("", b"")
     return sent.name, sent.content
 
 
 def bound(server: ViserServer) -> None:
-    """Take no file of more than ``MOST_SENT`` bytes: viser itself keeps all in memory."""
+    """Limit files to ``MOST_SENT`` bytes: viser itself keeps all in memory."""
     gui: Any = server.gui
 
     def start(client: Any, message: FileTransferStartUpload) -> None:

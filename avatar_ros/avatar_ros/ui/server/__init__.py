@@ -1,1 +1,1 @@
-"""Serves the planning page: who may use it, how fast messages go to a browser, and its index."""
+"""Server of the planning page: access, pace of messages to a browser, and the index page."""

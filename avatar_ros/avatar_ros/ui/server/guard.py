@@ -1,10 +1,10 @@
-"""Who may use the planning page: whoever holds its token, from the page itself.
+"""Access to the planning page: only with its token, and from the page itself.
 
-Every site that is open in a browser can send requests to this machine, from inside. As Jupyter
-does, each request is checked, those that open a WebSocket too:
+Every site that is open in a browser can send requests to this machine, from inside. As in Jupyter,
+each request is checked, also those that open a WebSocket:
 
 - Host: this machine by an address, by ``localhost`` or by its name. Another name belongs to a site
-  that lets it point here.
+  that directs its name here.
 - Origin, which browsers state: the page itself.
 - The token: at the end of the address that is printed, and then in a cookie.
 """
@@ -34,10 +34,11 @@ _EVERYWHERE = ("0.0.0.0", "::", "")
 
 
 class Guard:
-    """Checks requests to a page that listens on ``host``; a new token is drawn unless one is given.
+    """Check of requests to a page that listens on ``host``; it draws a token unless one is given.
 
-    A token that was given stays the same over restarts, and so do bookmarks of the page.
-    ``start`` is another at each, by which an open tab knows.
+    A given token stays the same over restarts, and so do bookmarks of the page. ``start`` changes
+    at
+    each start, so that an open tab notices.
     """
 
     def __init__(self, host: str, token: str = "") -> None:
@@ -46,15 +47,15 @@ class Guard:
         self._names = {"localhost", host.lower(), socket.gethostname().lower()}
 
     def address(self, port: int) -> str:
-        """Where the page is on this machine, with the token."""
+        """Return the address of the page on this machine, with the token."""
         host = "127.0.0.1" if self.host in _EVERYWHERE else self.host
         return f"http://{host}:{port}/?token={self.token}"
 
     def refusal(self, request: Request) -> str | None:
-        """Why a request is refused, or None."""
+        """Return why a request is refused, or None."""
         host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
         if not self._is_ours(host):
-            return "this page has another address than the one asked for"
+            return "this page has another address than the requested one"
         if origin is not None and urlsplit(origin).netloc != host:
             return "the request comes from another site"
         if not any(
@@ -64,7 +65,7 @@ class Guard:
         return None
 
     def remember(self, request: Request, response: Response) -> None:
-        """Let the browser keep the token, for this page alone."""
+        """Make the browser keep the token, for this page alone."""
         name = _cookie(request.headers["Host"])
         response.headers["Set-Cookie"] = f"{name}={self.token}; Path=/; HttpOnly; SameSite=Strict"
 
@@ -73,25 +74,25 @@ class Guard:
             place = urlsplit(f"//{host}")
             name, _ = place.hostname or "", place.port
             return name in self._names or bool(ip_address(name))
-        except ValueError:  # neither a name that is known nor an address, or no port
+        except ValueError:  # an unknown name, no address, or no port
             return False
 
 
 def _tokens(request: Request) -> list[str]:
-    """Those that a request holds, in its address and in its cookie."""
+    """Return the tokens in a request's address and cookie."""
     found = parse_qs(urlsplit(request.path).query).get("token", [])
     cookies: SimpleCookie = SimpleCookie()
     try:
         for line in request.headers.get_all("Cookie"):
             cookies.load(line)
-    except CookieError:  # of another page of this machine
+    except CookieError:  # set by another page of this machine
         return found
     name = _cookie(request.headers["Host"])
     return [*found, *([cookies[name].value] if name in cookies else [])]
 
 
 def _cookie(host: str) -> str:
-    """Name of the cookie: pages on other ports of a machine share its cookies."""
+    """Return the name of the cookie: pages on other ports of a machine share its cookies."""
     return f"avatar_{urlsplit(f'//{host}').port or 80}"
 
 
@@ -103,12 +104,13 @@ def _answer(status: HTTPStatus, text: str) -> Response:
 
 @contextmanager
 def guarded(guard: Guard, note: Callable[[str], bool] = lambda path: False) -> Iterator[None]:
-    """Servers of viser that start meanwhile ask the guard first.
+    """Make servers of viser that start in the body ask the guard first.
 
-    note : gets the path of each request that the guard lets through; whether that was all of it
+    note : called with the path of each admitted request; returns whether that answers it
 
-    viser takes no check of its own; it hands ``websockets.serve`` one that answers with its files.
-    It prints its address without the token, which nobody could open: the node logs the right one.
+    viser takes no check of its own; it hands ``websockets.serve`` a check that answers with its
+    files. It prints its address without the token, which nobody could open: the node logs the right
+    one.
     """
     serve: Any = websockets.asyncio.server.serve
 

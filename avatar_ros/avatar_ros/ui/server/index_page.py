@@ -1,8 +1,8 @@
-"""The page that viser serves, with what viser does not offer.
+"""The page that viser serves, with additions that viser does not offer.
 
-Its title; names of what has none, for a screen reader; the colour scheme of the system; text that
-contrasts enough; keys that move the tool again after a choice; a line over a tab whose cell ended
-or was started again; cube and alerts that stay where they are; and none of viser's own settings.
+Its title; names for screen readers; the colour scheme of the system; text with enough contrast;
+keys that move the tool again after a choice; a line over a tab whose cell ended or was restarted;
+cube and alerts that stay in place; and none of viser's own settings.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from websockets import Response
 
 TITLE = "avatar planning page"
 ALIVE = "/alive"  # address that answers with the number of the server's start
-DIMMED = {"light": "#5a636b", "dark": "#adb5bd"}  # of labels beside controls
-BLUE, LIGHT_BLUE = "#1971c2", "#74c0fc"  # of buttons, and of the chosen tab before a dark ground
-WARNING = "#b3261e"  # ground of what must not be missed, under white
-MOST_SENT = 512 << 20  # bytes of a file that a browser sends
+DIMMED = {"light": "#5a636b", "dark": "#adb5bd"}  # colours of labels beside controls
+# colours of buttons, and of the chosen tab on a dark background
+BLUE, LIGHT_BLUE = "#1971c2", "#74c0fc"
+WARNING = "#b3261e"  # background of alerts, under white text
+MOST_SENT = 512 << 20  # largest file that a browser may send [bytes]
 RESTARTED = (
     "This cell was started again and has another address. Open the one that planning_ui printed, "
     "which ends in ?token=..."
@@ -27,7 +28,7 @@ SILENT = (
     "Nothing comes from the cell: what this tab shows is old. Start the cell again, and open the "
     "address that it prints; with the same token, this tab comes back by itself."
 )
-ABOVE_TABS = 362  # height of the panel down to what is in a tab, with the legend of glass [px]
+ABOVE_TABS = 362  # height of the panel above a tab's content, with the legend of glass [px]
 _THEIRS = b"<title>Viser</title>"
 _STYLE = f"""
 html:root[data-mantine-color-scheme=light] {{ --mantine-color-gray-6: {DIMMED["light"]};

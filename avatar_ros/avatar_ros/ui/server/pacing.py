@@ -1,8 +1,8 @@
-"""Messages go to each browser as fast as it takes them, so that pictures never queue.
+"""Pacing of messages to each browser, so that pictures never queue.
 
-viser keeps the newest of all messages that replace each other, and sends them in windows. A browser
-that draws slowly would let the windows wait in its own memory. Here each window ends with a line of
-JavaScript that asks this server for an address; the window after the next waits until then.
+viser keeps the newest of all messages that replace each other, and sends them in windows. The
+windows would wait in the memory of a browser that draws slowly. Here each window ends with a line
+of JavaScript that asks this server for an address; the window after the next waits until then.
 Meanwhile newer messages replace those not sent yet.
 """
 
@@ -19,19 +19,19 @@ import viser.infra._infra as infra
 from viser._messages import RunJavascriptMessage
 
 TAKEN = "/taken/"  # path of the address, before the window's number
-PATIENCE = 2.0  # with a client that says nothing, as one without JavaScript [s]
+PATIENCE = 2.0  # time for a silent client, e.g. one without JavaScript [s]
 _AHEAD = 1  # windows that are sent before the last one was taken
 
 
 class Pacing:
-    """Which windows were sent and not yet taken, of all browsers; used in the server's thread."""
+    """Windows of all browsers that were sent and not yet taken; used in the server's thread."""
 
     def __init__(self) -> None:
         self._numbers = count()
         self._sent: dict[int, asyncio.Event] = {}
 
     def note(self, path: str) -> bool:
-        """Whether a path that a browser asks for says that a window was taken."""
+        """Note a path that a browser asks for; return whether it confirms a window."""
         name, found, number = path.partition(TAKEN)
         if name or not found or not number.isdecimal():
             return False
@@ -40,7 +40,7 @@ class Pacing:
         return True
 
     async def paced(self, windows: AsyncGenerator[Sequence[Any], None]) -> Any:
-        """The windows of one browser, each when all but the last before it were taken."""
+        """Yield the windows of one browser, each when all but the last before it were taken."""
         own: deque[int] = deque()
         try:
             async for window in windows:
@@ -59,13 +59,13 @@ class Pacing:
 
 
 def _say_taken(number: int) -> str:
-    """JavaScript that runs once all messages before it were applied."""
+    """Return JavaScript that runs once all messages before it were applied."""
     return f"fetch('{TAKEN}{number}').catch(() => {{}})"
 
 
 @contextmanager
 def paced(pacing: Pacing) -> Iterator[None]:
-    """Servers of viser that start meanwhile send to all browsers at their pace.
+    """Make servers of viser that start in the body send to each browser at its pace.
 
     viser has no flow control of its own; its server makes the buffer of messages by this name.
     """

@@ -1,4 +1,4 @@
-"""Alerts of the planning page: numbers that are not what they seem."""
+"""Alerts of the planning page: numbers with a caveat."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from avatar_ros.msg import ContactState
 from avatar_ros.ui.session.shown_period import ShownPeriod
 from avatar_ros.ui.session.texts import of_tools
 
-LARGE_ERROR = 0.10  # expected of the displacement or the force, from which a patient is marked
+LARGE_ERROR = 0.10  # expected error of displacement or force from which a patient is marked
 
 
 def alerts(
@@ -21,16 +21,16 @@ def alerts(
     shown: Sequence[ShownPeriod],
     labels: Sequence[str] = ("",),
 ) -> list[str]:
-    """One line each; none if the numbers are what they seem.
+    """Return the alerts, one line each; none if the numbers need no caveat.
 
     given : coordinates of the material that somebody chose
-    labels : of the tools, each of which has a period in ``shown``
+    labels : labels of the tools, each of which has a period in ``shown``
     """
     return [*alerts_of_organ(info, given), *of_tools(map(_of_period, shown), labels)]
 
 
 def alerts_of_organ(info: VademecumInfo, given: Collection[str]) -> list[str]:
-    """Alerts of an organ, whatever touches it; ``given`` as in :func:`alerts`."""
+    """Return the alerts of an organ, whatever touches it; ``given`` as in :func:`alerts`."""
     found = []
     if "young" not in given and info.young_modulus == Material().young_modulus:
         found.append(
@@ -49,10 +49,10 @@ def alerts_of_organ(info: VademecumInfo, given: Collection[str]) -> list[str]:
 def alerts_of_switch(
     switching: tuple[str, float] | None, in_force: str, records: bool
 ) -> list[str]:
-    """That a scene is being prepared, which may take minutes, and what runs until then.
+    """Return the alert that a scene is being prepared, which may take minutes.
 
     switching : its name, and for how long [s]; in_force : name of the scene that runs
-    records : whether a recording was asked for
+    records : whether a recording was requested
     """
     if switching is None:
         return []
@@ -65,5 +65,5 @@ def _of_period(shown: ShownPeriod) -> list[str]:
     if shown.missing:
         return [f"No force: {shown.missing}"]
     if shown.status == ContactState.STATUS_EXTRAPOLATED:
-        return ["Extrapolated: beyond what was computed; the force is a guess"]
+        return ["Extrapolated: beyond the computed range; do not rely on the force"]
     return []

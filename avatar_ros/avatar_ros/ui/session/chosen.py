@@ -1,4 +1,4 @@
-"""What a user chose on the planning page: scene, material, look, and the tools' places."""
+"""Choices of a user on the planning page: scene, material, look, and the tools' places."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from avatar_ros.ui.view.view import CUT, WHOLE
 
 
 class Page(NamedTuple):
-    """What choices bring about on the page."""
+    """Effects of choices on the page."""
 
     say: Callable[[str], None]
-    stop_recording: Callable[[str], None]  # and why
-    change_tips: Callable[[tuple[Tip, ...]], None]  # of all tools
+    stop_recording: Callable[[str], None]  # with the reason
+    change_tips: Callable[[tuple[Tip, ...]], None]  # tips of all tools
     show_material: Callable[[dict[str, float]], None]  # values by coordinate [SI]
-    show_look: Callable[[str, str, float], None]  # how, from which side, which part
+    show_look: Callable[[str, str, float], None]  # look, side and part of the cut
 
 
 class Chosen:
@@ -40,17 +40,17 @@ class Chosen:
 
     Parameters
     ----------
-    state : where the tools' places are
-    requests, page : what choices change in the cell and on the page
+    state : shared state with the tools' places
+    requests, page : requests to the cell and effects on the page
 
     Attributes
     ----------
-    organ : that is shown, None before the first
-    tools : their places
+    organ : the organ that is shown, None before the first
+    tools : the tools' places
     contact : parameters of the contact node, by name; empty until it was asked
     only : name of the one tool that the page moves, where devices move the others; empty: all
-    scene : name of the one chosen here, empty for the contact node's own
-    look : how the organ is shown, from which side, and which part of it
+    scene : name of the scene chosen here, empty for the contact node's own
+    look : how the organ is shown, side of the cut, and part that is cut away
     """
 
     def __init__(
@@ -65,17 +65,17 @@ class Chosen:
         self.scene = ""
         self.look = (WHOLE, "A", 0.5)
         self._known_scene: tuple[str, dict[str, float]] = ("", {})
-        self._dragged: float | None = None  # part that the handle of the cut is dragged to
+        self._dragged: float | None = None  # part to which the handle of the cut is dragged
         self._look_wanted: tuple[str, str, float] | None = None
 
     def forget(self, look: str) -> None:
-        """Another organ comes, in its own material, and is shown as ``look``."""
+        """Forget the choices for the last organ; show the next one as ``look``."""
         self._material = {}
         self._history.forget()
         self.look, self._dragged, self._look_wanted = (look, "A", 0.5), None, None
 
     def undo(self) -> None:
-        """Take the last choice back."""
+        """Undo the last choice."""
         what = self._history.undo()
         self._page.say(f"undone: {what}" if what else "nothing to undo")
 
@@ -83,12 +83,12 @@ class Chosen:
 
     @property
     def tip(self) -> Tip:
-        """Of the chosen tool."""
+        """Return the chosen tool's tip."""
         return self.tips[self.tools.chosen]
 
     @property
     def tips(self) -> tuple[Tip, ...]:
-        """Of the tools that the page moves, in their order."""
+        """Return the tips of the tools that the page moves, in their order."""
         if "tools" not in self.contact:
             return self._all_tips
         tips = dict(zip(self.contact["tools"], self._all_tips, strict=False))
@@ -96,29 +96,29 @@ class Chosen:
 
     @property
     def moved(self) -> tuple[str, ...]:
-        """Names of the contact node's tools that the page moves."""
+        """Return the names of the contact node's tools that the page moves."""
         return tuple(name for name in self.contact["tools"] if self.only in ("", name))
 
     @property
     def moves_all(self) -> bool:
-        """Whether no device moves another of the contact node's tools."""
+        """Return whether the page moves all of the contact node's tools."""
         return len(self.moved) == len(self.contact["tools"])
 
     @property
     def _all_tips(self) -> tuple[Tip, ...]:
-        """Of all tools of the contact node."""
+        """Return the tips of all tools of the contact node."""
         return (self.scene and _tips_of(self.scene)) or self._own_tips
 
     @property
     def _own_tips(self) -> tuple[Tip, ...]:
-        """As the contact node was started: those of its scene, if it was given one."""
+        """Return the tips of the contact node's start: those of its scene, if it was given one."""
         if "tools" not in self.contact:
             return (Tip(),)
         given = self.contact["scene"]
         return (given and _tips_of(given)) or chosen_tips(self.contact, len(self.contact["tools"]))
 
     def put_tool(self, place: Place, points: np.ndarray) -> str:
-        """Send the chosen tool over a place of the tissue; returns why not, if none reaches it.
+        """Send the chosen tool over a place of the tissue; return why not, if none reaches it.
 
         points : ndarray, shape (n, 3), of the cloud that is drawn [m]
         """
@@ -136,27 +136,28 @@ class Chosen:
 
     @property
     def in_force(self) -> dict[str, float]:
-        """Values of the material that are not those of the file, by coordinate [SI]."""
+        """Return the values of the material that differ from the file's, by coordinate [SI]."""
         contact = self.contact
         given = {MATERIAL[key]: contact[key] for key in MATERIAL if contact.get(key)}
         return given | self._material
 
     def values(self, organ: Organ) -> dict[str, float]:
-        """Of the organ's own coordinates, as built where nothing was chosen [SI].
+        """Return the values of the organ's own coordinates, as built where nothing was chosen [SI].
 
-        A tumour has the contrast of the scene that runs, and feels like the organ where that has
-        none. What the organ does not hold, the contact node does not use.
+        A tumour has the contrast of the scene that runs; without one it is as stiff as the organ.
+        The
+        contact node uses no coordinates that the organ does not hold.
         """
         used = organ.usable(self.given)
         return {name: used.get(name, built) for name, (_, _, built) in organ.ranges.items()}
 
     @property
     def given(self) -> dict[str, float]:
-        """Values of the material that somebody chose, by coordinate [SI]."""
+        """Return the values of the material that somebody chose, by coordinate [SI]."""
         return self._of_scene() | self.in_force
 
     def _of_scene(self) -> dict[str, float]:
-        """Values that the scene gives; none of natural effects."""
+        """Return the values that the scene gives; none for natural effects."""
         given = self.scene or self.contact.get("scene", "")
         if given != self._known_scene[0]:
             self._known_scene = given, _values_of(given)
@@ -180,17 +181,17 @@ class Chosen:
         self._page.show_material(values)
 
     def _read_back(self) -> None:
-        """Show what is in force after a refusal."""
+        """Show the values in force after a refusal."""
         self._material = {}
         self._requests.parameters_of_contact(tuple(MATERIAL), self.note_contact)
 
     def note_contact(self, values: dict[str, Any]) -> None:
-        """Parameters of the contact node, whoever set them."""
+        """Note parameters of the contact node, whoever set them."""
         self.contact |= values
         self._page.show_material(self.in_force)
 
     def follow_contact(self, values: dict[str, Any]) -> None:
-        """As :meth:`note_contact`, which is left out where nobody changed anything."""
+        """Note parameters of the contact node if any has changed."""
         if any(self.contact.get(name) != value for name, value in values.items()):
             self.note_contact(values)
 
@@ -202,7 +203,7 @@ class Chosen:
         self._switch(name)
 
     def _switch(self, name: str) -> None:
-        """To a shipped scene, or with an empty name back to the contact node's own."""
+        """Switch to a shipped scene, or with an empty name back to the contact node's own."""
         text = "" if name else self._own_scene()
         if not name and not text:
             self._page.say("the contact node does not say which scene it had; start it again")
@@ -219,16 +220,16 @@ class Chosen:
 
     @property
     def scene_name(self) -> str:
-        """Of what runs now, in words."""
+        """Return the name of the scene that runs now."""
         return self.scene or str(self.contact.get("scene") or "natural effects")
 
     def scene_in_force(self, organ: Organ) -> Scene:
-        """The scene that reproduces what runs now; ``contact`` must be known."""
+        """Return the scene that reproduces the present state; ``contact`` must be known."""
         given = self.scene or self.contact["scene"]
         return self._scene_of(organ, given, self.in_force, self._all_tips)
 
     def _own_scene(self) -> str:
-        """As the contact node was started, as YAML; empty if that is not known."""
+        """Return the contact node's scene at its start, as YAML; empty if that is not known."""
         if self.organ is None or "cloud" not in self.contact:
             return ""
         return write_scene(self._scene_of(self.organ, self.contact["scene"], {}, self._own_tips))
@@ -242,16 +243,16 @@ class Chosen:
         return scene_in_force(chosen, organ.vademecum, material, tools, cloud, divisor)
 
     def send_again(self) -> None:
-        """Send what was chosen here to a contact node that was started again."""
+        """Send the choices made here to a contact node that was restarted."""
         if self.scene:
             self._switch(self.scene)
         if self._material:
             self._requests.set_material(dict(self._material), self._page.say, self._read_back)
 
-    # --- The look, and all at once -----------------------------------------------------------
+    # --- The look, and a kept state ----------------------------------------------------------
 
     def choose_look(self, how: str, side: str, part: float) -> None:
-        """Show the organ whole, as glass or cut open, from a side, by a part: by :meth:`settle`."""
+        """Request a look: whole, glass or cut open, side and part; :meth:`settle` shows it."""
         self._look_wanted = how, side, part
 
     def _choose_look(self, how: str, side: str, part: float) -> None:
@@ -260,14 +261,14 @@ class Chosen:
         self._show_look(how, side, part)
 
     def drag_cut(self, part: float) -> None:
-        """The plane's handle is dragged; what it leaves is drawn by :meth:`settle`."""
+        """Note where the plane's handle is dragged; :meth:`settle` draws the cut."""
         self._dragged = part
 
     def settle(self) -> None:
-        """Show the organ as was asked for last, and cut where the handle was dragged to.
+        """Show the look that was requested last, and the cut where the handle was dragged to.
 
-        Not for each step of a slider or of the handle, as a cut takes time, and in one thread:
-        controls call from several.
+        A cut takes time, so it is not made for each step of a slider or handle. It is made in one
+        thread, because controls call from several.
         """
         wanted, self._look_wanted = self._look_wanted, None
         part, self._dragged = self._dragged, None
@@ -288,11 +289,11 @@ class Chosen:
         look: tuple[str, str, float],
         targets: np.ndarray,
     ) -> None:
-        """Choose all of a kept state; one step to undo.
+        """Return to a kept state; one step to undo.
 
         material : values by coordinate [SI]
-        targets : ndarray, shape (n, 3), of the tools [m]; of more or fewer than there are, those
-            that there are go to theirs
+        targets : ndarray, shape (n, 3), positions of the tools [m]; if their number differs, those
+            in both are moved
         """
         organ = self.organ
         if organ is None:
@@ -329,7 +330,7 @@ class Chosen:
 
 @cache
 def _tips_of(scene: str) -> tuple[Tip, ...]:
-    """Of a scene by name or path; none if it cannot be read."""
+    """Read the tips of a scene by name or path; none if it cannot be read."""
     try:
         return tuple(tool.tip for tool in read_scene(scene_file(scene)).tools)
     except AvatarError:
@@ -337,7 +338,7 @@ def _tips_of(scene: str) -> tuple[Tip, ...]:
 
 
 def _values_of(scene: str) -> dict[str, float]:
-    """Of a scene by name or path; none if it cannot be read."""
+    """Read the values of a scene by name or path; none if it cannot be read."""
     try:
         found = read_scene(scene_file(scene)) if scene else None
     except AvatarError:

@@ -1,4 +1,4 @@
-"""What the colours of the organ show: the displacement, or error and spread of the force."""
+"""Colours of the organ: the displacement, or error and spread of the force."""
 
 from __future__ import annotations
 
@@ -44,21 +44,21 @@ class Coloured:
     ) -> None:
         self._view, self._chosen, self._say = view, chosen, say
         self._show, self._in_executor = show, in_executor
-        self._field = self._wanted = DISPLACEMENT  # drawn, and asked for
+        self._field = self._wanted = DISPLACEMENT  # drawn, and requested
 
     def forget(self) -> None:
-        """Another organ shows its displacement first."""
+        """Show the displacement of another organ first."""
         self._field = self._wanted = DISPLACEMENT
 
     def legend(self) -> str:
-        """The colour scale of what is drawn, as HTML."""
+        """Return the present colour scale as HTML."""
         view, organ = self._view, self._chosen.organ
         has_springs = organ is not None and bool(organ.sprung.any())
         return legend.legend(*self.scale, view.opacity, has_springs, view.is_reach_marked)
 
     @property
     def scale(self) -> tuple[str, float]:
-        """Name of the colour scale with its unit, and its end in that unit."""
+        """Return the name of the colour scale with its unit, and its end in that unit."""
         if self._field == DISPLACEMENT:
             return legend.DISPLACEMENT, 1e3 * self._view.top
         return _LEGENDS[self._field], 1e2 * self._view.field_top
@@ -80,7 +80,7 @@ class Coloured:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Fields to choose from: a spread only where something is said to be unknown."""
+        """Return the fields to choose from: a spread only if distributions are given."""
         fields = FIELDS if self._chosen.contact.get("uncertainty") else (DISPLACEMENT, ERROR)
         if self._wanted not in fields:
             self.choose(DISPLACEMENT)
@@ -99,7 +99,7 @@ class Coloured:
         self._paint(organ, SPREAD, spread, "no tool reaches this organ")
 
     def _known(self, organ: Organ, given: dict[str, Distribution]) -> dict[str, Distribution]:
-        """Of all parameters of the organ; without a distribution, the value in use is meant."""
+        """Return distributions of the organ's parameters; by default fixed at the value in use."""
         held = Held.by(organ.vademecum)
         used, notices = usable_known(organ.name, held, given)
         for notice in notices:
@@ -119,11 +119,11 @@ class Coloured:
             self._view.paint(values)
 
     def _is_wanted(self, organ: Organ, field: str) -> bool:
-        """Whether neither another organ nor another field was chosen meanwhile."""
+        """Return whether neither another organ nor another field was chosen meanwhile."""
         return organ is self._chosen.organ and field == self._wanted
 
     def _refuse(self, reason: str) -> None:
-        """What is drawn stays, and the control says so."""
+        """Keep the present field, and set the control back to it."""
         self._say(reason)
         self._wanted = self._field
         self._show(self._field)

@@ -1,8 +1,8 @@
-"""The band of the force on the planning page's chosen tool: 90 % of what is known of the material.
+"""The 90 % band of the force on the planning page's chosen tool, from the material's distributions.
 
-Its edges come by two topics, a thousand times a second; the page takes the newest of each for a
-picture. Each is set against the force of its own period, so that what is shown beside another
-period's force is in proportion to it.
+Its edges come on two topics, a thousand times a second; the page takes the newest of each for a
+picture. Each is divided by the force of its own period, so that the band can be scaled to another
+period's force.
 """
 
 from __future__ import annotations
@@ -19,38 +19,38 @@ from avatar_ros.framework import qos
 from avatar_ros.framework.ports import PolledSubscriptions
 from avatar_ros.loop.safety import BAND
 
-_LEAST = 0.01  # force that has a band [N]
-_SILENCE = 1.0  # after which there is none any more [s]
+_LEAST = 0.01  # smallest force that has a band [N]
+_SILENCE = 1.0  # time without edges after which there is no band [s]
 
 
 class BandRatios:
-    """Both edges over the force, of the newest periods of which both are known."""
+    """Both edges over the force, from the newest periods for which both are known."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self.forget()
 
     def forget(self) -> None:
-        """Another organ: nothing of the last one is shown."""
+        """Forget the last organ's band."""
         self._ratios, self._heard = [float("nan")] * 2, [-np.inf] * 2
 
     def note(self, k: int, edge: float, force: float) -> None:
-        """Edge k, 0 the low one, of a period with a force, both [N]."""
+        """Note edge k (0: the low one) of a period with a force, both [N]."""
         if force > _LEAST:
             self._ratios[k], self._heard[k] = edge / force, self._clock()
 
     def of(self, force: float) -> tuple[float, float] | None:
-        """The band of a force [N]; None if none was heard lately."""
+        """Return the band of a force [N]; None if none was heard lately."""
         if force <= _LEAST or self._clock() - min(self._heard) > _SILENCE:
             return None
         return self._ratios[0] * force, self._ratios[1] * force
 
 
 class NewestBand(BandRatios):
-    """Subscribes both edges of a tool's force, once it is told of which.
+    """Subscriber of both edges of the chosen tool's force.
 
-    force_of : of a tool, by its place in the list, in the period of a stamp [ns], in newtons; NaN
-        if it is not known
+    force_of : returns the force [N] on a tool, by its index, in the period of a stamp [ns]; NaN if
+        it is not known
     """
 
     def __init__(self, node: Node, force_of: Callable[[int, int], float]) -> None:
@@ -78,7 +78,7 @@ class NewestBand(BandRatios):
         ]
 
     def take(self) -> None:
-        """Note what came since the last call."""
+        """Note the edges that came since the last call."""
         for k, subscription in enumerate(self._subscriptions):
             with subscription.handle:
                 taken = subscription.handle.take_message(WrenchStamped, False)
@@ -96,4 +96,4 @@ class NewestBand(BandRatios):
 
 
 def _never_called(message: Any) -> None:
-    """Edges are taken, not delivered."""
+    """Do nothing: edges are taken, not delivered."""

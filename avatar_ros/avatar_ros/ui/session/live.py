@@ -1,4 +1,4 @@
-"""What the contact node sends now, as the planning page draws it: each cloud with its period."""
+"""Live data of the contact node, as the planning page draws them: each cloud with its period."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from avatar_ros.ui.tools.tool_state import SharedToolState
 from avatar_ros.ui.view.display import NewestCloud
 from avatar_ros.ui.view.view import OrganView
 
-_SILENCE = 1.0  # after which the contact node counts as not answering [s]
+_SILENCE = 1.0  # time after which the contact node counts as not answering [s]
 
 
 class Live:
     """Takes the clouds, and finds the forces of their periods.
 
-    node : subscribes; state : has the periods; recorder : keeps the clouds of a recording
-    organ : number of the one that is shown, by which its periods are told from those of another
+    node : subscribes; state : holds the periods; recorder : keeps the clouds of a recording
+    organ : number of the organ that is shown; periods of another organ are not drawn
     """
 
     def __init__(self, node: Node, state: SharedToolState, recorder: Recorder) -> None:
@@ -34,10 +34,11 @@ class Live:
 
     @property
     def is_listening(self) -> bool:
+        """Return whether clouds are subscribed."""
         return self._cloud is not None
 
     def listen(self, frame_id: str, n_points: int) -> None:
-        """Take clouds of so many points in a frame, and no others any more."""
+        """Take clouds with this number of points in a frame, and no others."""
         self.close()
         self._cloud = NewestCloud(self._node, frame_id, n_points)
 
@@ -48,28 +49,28 @@ class Live:
             self._cloud = None
 
     def forget(self) -> None:
-        """Another organ, or other tools: nothing of the last ones is shown any more."""
+        """Forget the last organ or tools, so that nothing of them is shown."""
         self._periods.forget()
         self.pause()
 
     def pause(self) -> None:
-        """Something else is drawn meanwhile."""
+        """Forget the drawn period while something else is drawn."""
         self._shown = ()
 
     @property
     def answers(self) -> bool:
-        """Whether the contact node answered recently."""
+        """Return whether the contact node answered recently."""
         silence = time.monotonic_ns() - int(self._state.all["heard"][0])
         return silence < _SILENCE * 1e9
 
     @property
     def statuses(self) -> tuple[int, ...]:
-        """Of each tool in the last period, if one came recently."""
+        """Return the status of each tool in the last period, if one came recently."""
         period = self._state.period() if self.answers else None
         return () if period is None else tuple(period["status"].tolist())
 
     def draw(self, view: OrganView) -> tuple[ShownPeriod, ...]:
-        """Draw the newest cloud, and return what belongs to it of each tool."""
+        """Draw the newest cloud, and return each tool's numbers of its period."""
         sent, cloud, now = self._state.sent, self._cloud, time.monotonic()
         taken = cloud.take() if cloud is not None else None
         if not self.answers:
@@ -95,7 +96,7 @@ class Live:
     def _without_force(
         self, view: OrganView, sent: np.ndarray, missing: str
     ) -> tuple[ShownPeriod, ...]:
-        """Whatever is drawn is not of now."""
+        """Mark the picture as not present, and return numbers without forces."""
         view.grey(True)
         self._periods.forget()
         self._shown = tuple(ShownPeriod.without_force(tip, missing) for tip in sent)

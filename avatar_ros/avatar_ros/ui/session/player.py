@@ -1,4 +1,4 @@
-"""Recordings of the library, played and scrubbed: what was drawn then, with its numbers."""
+"""Player of recordings in the library: play and scrub the recorded pictures and numbers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from avatar_ros.ui.session.presets import values_of
 from avatar_ros.ui.session.shown_period import PLACE, ShownPeriod, why_missing
 from avatar_ros.ui.view.organ import Organ
 
-_REPEATED = 1.0  # s: the last state stays so long before it begins again
+_REPEATED = 1.0  # time for which the last state stays before it begins again [s]
 
 
 class Played(NamedTuple):
@@ -35,9 +35,9 @@ class Played(NamedTuple):
 
 
 class Player:
-    """One recording at a time, of the organ that is shown and of no other.
+    """Player of one recording at a time, of the organ that is shown and of no other.
 
-    seconds : of the recording; is_on : its states are drawn in place of those of now
+    seconds : duration; is_on : whether its states are drawn in place of the present ones
     """
 
     def __init__(self, folder: Path, reader: Reader) -> None:
@@ -45,37 +45,39 @@ class Player:
         self._recording: Recording | None = None
         self._name = ""
         self._rows = np.zeros(0, int)  # period of each cloud
-        self._valid = np.zeros(0, int)  # the last cloud within the range
-        self._placed = np.zeros((0, 1), int)  # the last cloud at which each tool was placed
-        self._times = np.zeros(0)  # of each cloud, from the first [s]
-        self._given: dict[str, float] = {}  # of the material, by coordinate [SI]
-        self._place, self._began = 0.0, 0.0  # [s], and when it was there
+        self._valid = np.zeros(0, int)  # for each cloud, the last one within the range
+        # for each cloud, the last one at which each tool was placed
+        self._placed = np.zeros((0, 1), int)
+        self._times = np.zeros(0)  # time of each cloud, from the first [s]
+        self._given: dict[str, float] = {}  # values of the material, by coordinate [SI]
+        self._place, self._began = 0.0, 0.0  # position [s], and the time when it was there
         self._runs = False
 
     @property
     def is_on(self) -> bool:
+        """Return whether a recording is shown."""
         return self._recording is not None
 
     @property
     def seconds(self) -> float:
-        """Of the clouds of the recording [s]."""
+        """Return the duration of the recording's clouds [s]."""
         return float(self._times[-1]) if len(self._times) else 0.0
 
     @property
     def part(self) -> float:
-        """How far it is, 0 to 1."""
+        """Return the fraction that was played, 0 to 1."""
         return self.place / self.seconds if self.seconds > 0.0 else 0.0
 
     @property
     def place(self) -> float:
-        """Time that is shown, from the first cloud on [s]."""
+        """Return the time that is shown, from the first cloud on [s]."""
         if not self._runs:
             return self._place
         since = self._place + time.monotonic() - self._began
         return min(since % (self.seconds + _REPEATED), self.seconds)
 
     def open(self, name: str, organ: Organ, n_tools: int) -> str:
-        """Play a recording of an organ and of so many tools; returns why not, empty if it plays."""
+        """Play a recording of an organ and this number of tools; return why not, or ""."""
         self.close()
         path = self._folder / name
         try:
@@ -84,13 +86,13 @@ class Player:
         except (OSError, AvatarError) as error:
             return str(error)
         if found.vademecum_id != organ.id:
-            return f"{name} is of {found.vademecum_name}, another organ; load that one first"
+            return f"{name} belongs to {found.vademecum_name}, another organ; load that organ first"
         n_points = len(organ.vertices)
         if found.clouds.displacement.shape[1:] != (n_points, 3):
             return f"{name} holds no surface that was shown; record again"
         n_recorded = found.periods.tip.shape[1]
         if n_recorded != n_tools:
-            return f"{name} is of {n_recorded} tools, the cell has {n_tools}; start it with as many"
+            return f"{name} has {n_recorded} tools, the cell {n_tools}; start a cell with as many"
         number = found.periods.number
         rows = np.clip(np.searchsorted(number, found.clouds.period), 0, len(number) - 1)
         stamps = found.periods.stamp[rows]
@@ -104,23 +106,23 @@ class Player:
         return ""
 
     def is_playing(self, name: str) -> bool:
-        """Whether that recording is shown, moving or not."""
+        """Return whether that recording is shown, moving or not."""
         return self.is_on and self._name == name
 
     def close(self) -> None:
-        """Show what is now again."""
+        """Show the present state again."""
         self._recording, self._runs = None, False
 
     def pause(self, paused: bool) -> None:
-        """Stay where it is, or go on."""
+        """Pause or go on."""
         self._place, self._began, self._runs = self.place, time.monotonic(), not paused
 
     def seek(self, part: float) -> None:
-        """Stay at a part of the time, 0 to 1."""
+        """Pause at a fraction of the time, 0 to 1."""
         self._place, self._runs = part * self.seconds, False
 
     def state(self, organ: Organ) -> Played | None:
-        """What is to be shown; None of now.
+        """Return the state to show; None for the present one.
 
         As live, the last valid shape stays while a tool is beyond the range.
         """
@@ -137,7 +139,7 @@ class Player:
         return Played(cloud, shown, material, given)
 
     def _shown(self, recording: Recording, k: int, largest: float) -> tuple[ShownPeriod, ...]:
-        """Numbers of each tool at a cloud, or at the last valid one."""
+        """Return the numbers of each tool at a cloud, or at the last valid one."""
         periods, valid = recording.periods, int(self._valid[k])
         row, is_held = self._rows[valid], valid < k  # any row, where none is valid
         tips = [self._tip(periods, tool, k) for tool in range(periods.tip.shape[1])]
@@ -159,22 +161,22 @@ class Player:
         )
 
     def _tip(self, periods: Periods, tool: int, k: int) -> np.ndarray:
-        """Where a tool was placed last, up to a cloud [m]."""
+        """Return where a tool was placed last, up to a cloud [m]."""
         placed = int(self._placed[k, tool])
         return periods.tip[self._rows[placed], tool] if placed >= 0 else np.full(3, PLACE)
 
     @property
     def alerts(self) -> list[str]:
-        """What must not be missed while it plays."""
+        """Return the alert while a recording is shown."""
         if self._recording is None:
             return []
         return [
             f"Recording {self._name}, {self.place:.1f} of {self.seconds:.1f} s: "
-            "not what the tool feels now"
+            "not the present state"
         ]
 
 
 def _last(known: np.ndarray) -> np.ndarray:
-    """For each place along the first axis the last one up to it that is known, -1 before it."""
+    """Return for each place along the first axis the last known one up to it, -1 before it."""
     places = np.arange(len(known)).reshape(-1, *[1] * (known.ndim - 1))
     return np.asarray(np.maximum.accumulate(np.where(known, places, -1)))

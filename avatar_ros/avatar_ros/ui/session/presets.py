@@ -1,4 +1,4 @@
-"""Materials to choose from on the planning page, each with where its stiffness was measured."""
+"""Materials to choose from on the planning page, with the source of each stiffness."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from avatar_core.reduction.coordinates import RESECTION
 from avatar_core.scene.model import Scene
 from avatar_ros.ui.view.organ import Organ
 
-# Label and unit of each coordinate of the material, and what one shown unit is in SI.
+# label and unit of each coordinate of the material, and the shown unit in SI
 SLIDERS = {
     "young": ("E [kPa]", 1e3),
     "poisson": ("nu [-]", 1.0),
@@ -27,11 +27,14 @@ HINTS = {
 for _name in ATTACHMENTS:
     _words = _name.replace("_", " ").capitalize()
     SLIDERS[SUPPORT + _name] = (f"{_words} [kPa/mm]", 1e6)
-    HINTS[SUPPORT + _name] = "Stiffness per area of what holds the organ there"
+    HINTS[SUPPORT + _name] = "Stiffness per area of this support"
 
 
 class Preset(NamedTuple):
-    """young_modulus : [Pa]; source : of the number."""
+    """Young's modulus of a tissue.
+
+    young_modulus : [Pa]; source : publication of the number
+    """
 
     young_modulus: float
     source: str
@@ -57,12 +60,12 @@ PRESETS = {
 
 
 def source_of(name: str) -> str:
-    """Where the stiffness of a preset comes from, as Markdown."""
+    """Return the source of a preset's stiffness, as Markdown."""
     return f"E from {PRESETS[name].source}."
 
 
 def material_text(organ: Organ, values: dict[str, float]) -> str:
-    """The material in force, by coordinate of an organ [SI], in one line."""
+    """Return the material in force, by coordinate of an organ [SI], in one line."""
     poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
     contrast = values.get("contrast")
     inside = "; as stiff inside" if organ.structures else ""
@@ -71,7 +74,7 @@ def material_text(organ: Organ, values: dict[str, float]) -> str:
 
 
 def values_of(scene: Scene) -> dict[str, float]:
-    """Values of a scene by coordinate [SI]; without its effect, a tumour is like the organ."""
+    """Return a scene's values by coordinate [SI]; without its effect, a tumour is as the organ."""
     tumours = [effect.contrast for effect in scene.effects if isinstance(effect, Tumour)]
     contrast = tumours[0] if tumours else 1.0
     return scene.values | ({} if contrast is None else {"contrast": contrast})

@@ -29,7 +29,7 @@ def scene_in_force(
     cloud: Cloud = "surface",
     cloud_divisor: int = 1,
 ) -> Scene:
-    """The scene that reproduces what runs now, including its material.
+    """Return the scene that reproduces the present state, including its material.
 
     chosen : None for the natural effects of the vademecum, with tools and cloud as given
     material : values by coordinate, which override those of the scene
@@ -59,10 +59,7 @@ def scene_in_force(
 
 
 class Recorder:
-    """One recording at a time: ``open``, ``begin``, ``save``.
-
-    is_on : periods are being recorded
-    """
+    """Recorder of one recording at a time: ``open``, ``begin``, ``save``."""
 
     def __init__(self, state: SharedToolState) -> None:
         self._state = state
@@ -73,11 +70,12 @@ class Recorder:
 
     @property
     def is_on(self) -> bool:
+        """Return whether periods are being recorded."""
         return bool(self._state.all["recording"][0])
 
     @property
     def is_full(self) -> bool:
-        """Nothing more is kept: of periods, or of surfaces."""
+        """Return whether the space for periods or for surfaces is full."""
         n = len(self._clouds)
         return self.is_on and (
             int(self._state.all["n_rows"][0]) >= N_ROWS
@@ -86,11 +84,11 @@ class Recorder:
 
     @property
     def n_periods(self) -> int:
-        """Periods recorded so far; none until the new model is in use."""
+        """Return the number of recorded periods; none until the new model is in use."""
         return int(self._state.all["n_rows"][0]) - self._begin if self._begin >= 0 else 0
 
     def open(self, vademecum: Vademecum, scene: Scene, rate: float) -> str:
-        """Record from now on, before the new model is in use; returns the scene's text."""
+        """Record from now on, before the new model is in use; return the scene's text."""
         text = write_scene(scene)
         self._about = (vademecum.id, vademecum.name, text, rate)
         self._clouds, self._after, self._begin = [], [], -1
@@ -99,11 +97,11 @@ class Recorder:
         return text
 
     def begin(self) -> None:
-        """The new model is in use: discard what was recorded before."""
+        """Discard earlier periods: the new model is in use."""
         self._begin = int(self._state.all["n_rows"][0])
 
     def note_cloud(self, displacement: np.ndarray, period: int) -> None:
-        """Record a cloud that was shown, (n_points, 3) [m], of the period of a number."""
+        """Record a shown cloud, (n_points, 3) [m], with the number of its period."""
         n = int(self._state.all["n_rows"][0])
         if self._begin >= 0 and n > self._begin:
             first = int(self._state.rows["number"][0, self._begin])
@@ -117,11 +115,12 @@ class Recorder:
         self._begin = -1
 
     def save(self, folder: Path) -> tuple[Path, Recording] | None:
-        """Stop and write a file named by the time; None if nothing was recorded.
+        """Stop and write a file named by the time; return None if nothing was recorded.
 
         Raises
         ------
-        StorageError : it could not be written
+        StorageError
+            If the file could not be written.
         """
         begin = self._begin
         self.drop()
@@ -150,7 +149,7 @@ class Recorder:
 
 
 def _periods(rows: np.ndarray) -> Periods:
-    """The recorded periods, of rows (n_tools, n)."""
+    """Return the recorded periods of rows (n_tools, n)."""
     rows = rows.T.copy()
     return Periods(
         number=rows["number"][:, 0].copy(),

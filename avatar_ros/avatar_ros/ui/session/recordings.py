@@ -1,4 +1,4 @@
-"""Records at the planning page what its tools do, and plays what was recorded."""
+"""Recordings of the page's tools, and their playing."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from avatar_ros.ui.tools.tool_state import SharedToolState
 
 
 class Page(NamedTuple):
-    """What the page does for recordings.
+    """Effects of recordings on the page.
 
-    say : show a line
-    show_recording : show whether one is being made
-    answers : whether the contact node answered recently
+    say : shows a line
+    show_recording : shows whether a recording is being made
+    answers : returns whether the contact node answered recently
     """
 
     say: Callable[[str], None]
@@ -35,9 +35,9 @@ class Recordings:
 
     Parameters
     ----------
-    folder : of the files
-    chosen : organ, scene and material that a recording is of
-    state : tells if a tool touches
+    folder : folder of the files
+    chosen : organ, scene and material of a recording
+    state : shared state, which tells if a tool touches
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Recordings:
         self._requests, self._chosen, self._state, self._page = requests, chosen, state, page
 
     def play(self, name: str) -> None:
-        """Play a recording from its begin, or go on with the one that was paused."""
+        """Play a recording from its begin, or go on with the paused one."""
         organ = self._chosen.organ
         if organ is None:
             self._page.say("nothing to play: choose the organ of a recording first")
@@ -64,7 +64,7 @@ class Recordings:
             self._page.say(self._player.open(name, organ, len(self._chosen.tools.labels)))
 
     def record(self, on: bool) -> None:
-        """Begin a recording, once the scene in force has been loaded anew; or end it."""
+        """Begin a recording once the scene in force has been loaded anew, or end it."""
         if not on:
             self.stop("")
             return
@@ -88,7 +88,7 @@ class Recordings:
         self._requests.load_scene(scene.name, say, yaml=text, then=self._begin)
 
     def _begin(self, switched: bool) -> None:
-        touching = self._touching()  # half a minute after the click
+        touching = self._touching()  # it may be half a minute after the click
         if switched and not touching:
             self._recorder.begin()
             return
@@ -98,13 +98,13 @@ class Recordings:
             self._page.say(f"not recorded: {touching} touched the organ again; lift, and record")
 
     def _touching(self) -> str:
-        """Which tools touch now, in words; empty if none does."""
+        """Name the tools that touch now; empty if none does."""
         period, labels = self._state.period(), self._chosen.tools.labels
         touches = [] if period is None else np.flatnonzero(period["touches"]).tolist()
         return " and ".join(labels[k] or "the tool" for k in touches)
 
     def stop(self, why: str) -> None:
-        """End a recording and write its file, if there is one; ``why`` if nobody asked for it."""
+        """End a recording and write its file, if there is one; ``why`` if no user asked for it."""
         if not self._recorder.is_on:
             return
         self._page.show_recording(False)

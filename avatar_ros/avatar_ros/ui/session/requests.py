@@ -21,7 +21,7 @@ from avatar_ros.action import BuildPatient
 from avatar_ros.loop.settings import MATERIAL
 from avatar_ros.srv import LoadScene, LoadVademecum
 
-# How to start a node that does not run.
+# how to start a node that does not run
 START = {
     "contact": "the contact node is not running, so there is no force: "
     "start it with `ros2 run avatar_ros contact`",
@@ -30,7 +30,8 @@ START = {
     "patient_interpolation": "the node that builds patients is not running: "
     "start it with an atlas, `avatar cell --atlas FOLDER`",
 }
-_PARAMETERS = {name: key for key, name in MATERIAL.items()}  # of the contact node, by coordinate
+# parameters of the contact node, by coordinate
+_PARAMETERS = {name: key for key, name in MATERIAL.items()}
 
 Report = Callable[[str], None]
 Progress = Callable[[str, float, float], None]
@@ -41,11 +42,11 @@ class Wanted(NamedTuple):
 
     surface : file of the library; unit, axes : of its coordinates; empty: mm, and as it states
     tolerance : mean relative error of the displacement
-    label, inside : of a label map, the organ and what lies inside; empty for the only one
+    label, inside : labels of a label map for the organ and structures in it; empty: the only one
     groups : file of the library with clamp, access and springs; empty for those of the template
     supports : springs instead of the clamp, as on the command line; empty for the clamp
-    preview : show what would hold it, and build nothing
-    interpolated_first : write an interpolated one to the file first
+    preview : show the regions that would be held, and build nothing
+    interpolated_first : first write an interpolated vademecum to the file
     """
 
     surface: str
@@ -63,7 +64,7 @@ class Wanted(NamedTuple):
 
 @dataclass
 class _Build:
-    """Who hears of a build: in words, and its result; has_first: the interpolated one is there."""
+    """Callbacks of a build: text, and result; has_first: an interpolated vademecum is written."""
 
     report: Report
     then: Callable[[Any], None]
@@ -73,9 +74,9 @@ class _Build:
 class Requests:
     """Clients of the cell's services and of its action.
 
-    The page calls from threads of its own. rclpy notes a goal, unlike a request of a service, only
-    after it was sent: an answer that the executor takes before is lost, and the end of the build
-    with it. So goals are sent in the executor's thread.
+    The page calls from separate threads. Unlike a service's request, rclpy notes a goal only after
+    sending it. An answer that the executor takes before is lost, and so is the build's end. So
+    goals are sent in the executor's thread.
     """
 
     def __init__(self, node: Node) -> None:
@@ -85,30 +86,30 @@ class Requests:
         self._set = node.create_client(SetParameters, "contact/set_parameters")
         self._get = node.create_client(GetParameters, "contact/get_parameters")
         self._build = ActionClient(node, BuildPatient, "build_patient")
-        self._pending: _Build | None = None  # that is under way
+        self._pending: _Build | None = None  # the running build
         self._goal: Any = None
         self._waiting: dict[str, float] = {}  # values of the material not sent yet
         self._setting = False
-        self._switch: tuple[str, float] | None = None  # scene that was asked for last, and when [s]
+        self._switch: tuple[str, float] | None = None  # scene that was requested last, and when [s]
 
     def close(self) -> None:
-        """Release what the middleware holds for the action."""
+        """Release the middleware's part of the action."""
         self._build.destroy()
 
     def contact_started(self) -> None:
-        """What the node before was asked for is not answered any more."""
+        """Drop requests to a previous contact node, which nobody will answer."""
         self._waiting, self._setting, self._switch = {}, False, None
 
     @property
     def switching(self) -> tuple[str, float] | None:
-        """The scene that is being prepared, and for how long [s]; None if none is."""
+        """Return the scene that is being prepared, and for how long [s]; None if none is."""
         if self._switch is None or not self._load_scene.service_is_ready():
             return None
         return self._switch[0], time.monotonic() - self._switch[1]
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Names of the nodes whose services are not available."""
+        """Name the nodes whose services are not available."""
         ready = {
             "vademecum_loader": self._load_vademecum.service_is_ready(),
             "contact": self._load_scene.service_is_ready(),
@@ -117,14 +118,14 @@ class Requests:
         return tuple(name for name, is_ready in ready.items() if not is_ready)
 
     def load_vademecum(self, name: str, report: Report) -> None:
-        """Have the loader announce a file of its library; what is announced is shown in time."""
+        """Make the loader announce a file of its library; the page shows it when announced."""
         if not self._load_vademecum.service_is_ready():
             report(START["vademecum_loader"])
             return
         report(f"loading {name} ...")
 
         def answered(done: Any) -> None:
-            # The organ may come before the answer, and says more than "loaded".
+            # the organ may come before the answer, and says more than "loaded"
             if failure := _outcome(done, ""):
                 report(failure)
 
@@ -138,7 +139,7 @@ class Requests:
         yaml: str = "",
         then: Callable[[bool], None] = lambda _: None,
     ) -> None:
-        """Switch the scene, by name or by its text; calls ``then`` with the success."""
+        """Switch the scene, by name or by its text; call ``then`` with the success."""
         if not self._load_scene.service_is_ready():
             report(START["contact"])
             then(False)
@@ -207,11 +208,11 @@ class Requests:
         then: Callable[[Any], None],
         first: Callable[[str], None] = lambda file: None,
     ) -> None:
-        """Build or preview a patient; calls ``then`` with the result, None if there is none.
+        """Build or preview a patient; call ``then`` with the result, None if there is none.
 
-        first : hears once of the interpolated file, if that was asked for
+        first : called once with the interpolated file, if it was requested
 
-        One at a time: another is refused until then.
+        Only one build runs at a time; further requests are refused.
         """
         if self._pending is not None:
             report("a patient is being built already; cancel it first")
@@ -250,18 +251,18 @@ class Requests:
         )
 
     def _end_build(self, build: _Build, result: Any) -> None:
-        if self._pending is build:  # it was not given up
+        if self._pending is build:  # it was not cancelled
             self._goal = self._pending = None
             build.then(result)
 
     def builder_is_missing(self) -> None:
-        """The patients' node is not there: a build that it was asked for has come to nothing."""
+        """End the running build: the patients' node is gone."""
         if self._pending is not None:
             self._pending.report(f"the patients' node ended; {START['patient_interpolation']}")
             self._end_build(self._pending, None)
 
     def cancel_patient(self) -> None:
-        """Cancel the build that is under way, if any."""
+        """Cancel the running build, if any."""
 
         def cancel() -> None:
             if self._goal is not None:
@@ -271,7 +272,7 @@ class Requests:
 
     def _in_executor(self, do: Callable[[], object]) -> None:
         """Call in the thread that takes the answers."""
-        assert self._node.executor is not None  # which runs the node
+        assert self._node.executor is not None  # the executor runs the node
         self._node.executor.create_task(do)
 
 

@@ -1,11 +1,11 @@
-"""What the planning page shows at a time: one period of the loop, or the last valid one.
+"""Choice of the period that the planning page shows: one of the loop, or the last valid one.
 
-A cloud and the forces that belong to it come by two ways. Shown together are those of one stamp. A
-step computes no force for a tool whose poses it does not use, as they are too slow, and for a tip
-beyond what the vademecum covers. The organ of that period lies as if this tool did not touch it.
-The shape of the last period with a force therefore stays, marked as what it is, until the force is
-known again; with it, the forces of all tools. Where there was none, where nobody answers or an
-answer is of another organ, no number is written: zero is one.
+A cloud and its forces come on two topics. They are shown together if they have the same stamp. A
+step computes no force for a tool whose poses it does not use, e.g. because they are too slow, nor
+for a tip beyond the vademecum's range. The organ of that period lies as if this tool did not touch
+it. The shape of the last period with a force then stays, in grey, with the forces of all tools,
+until the force is known again. Without such a period, without an answer, or for another organ, no
+number is written: zero would be a number.
 """
 
 from __future__ import annotations
@@ -27,15 +27,16 @@ PLACE = 10.0  # no tool of an organ is farther off; a step without a pose has it
 class ShownPeriod(NamedTuple):
     """Numbers of one tool beside the picture.
 
-    tip : where the tool is drawn [m]
-    force : of the organ [N], before the limits for a device: the page has none
-    error : of the force [N]; NaN if unknown
-    largest : displacement of the organ [m]; NaN where no cloud comes
+    tip : position of the drawn tool [m]
+    force : force of the organ [N], before the limits for a device: the page has none
+    error : error of the force [N]; NaN if unknown
+    largest : largest displacement of the organ [m]; NaN where no cloud comes
     missing : why there is no force; empty if there is one
-    is_held : there is none, and force and displacement are those of the last valid period
-    status : of avatar_ros/msg/ContactState
+    is_held : whether force and displacement are those of the last valid period, for lack of new
+    ones
+    status : status of avatar_ros/msg/ContactState
     holds : whether its jaw holds tissue
-    band : that holds 90 % of what is known of the material, of the force [N]; None if not asked for
+    band : 90 % band of the force from the material's distributions [N]; None if not requested
     """
 
     tip: np.ndarray
@@ -50,42 +51,43 @@ class ShownPeriod(NamedTuple):
 
     @staticmethod
     def without_force(tip: np.ndarray, missing: str) -> ShownPeriod:
-        """Of a period of which nothing is known but where the tool is [m]."""
+        """Return numbers of a period in which only the tool's position is known [m]."""
         return ShownPeriod(tip, np.zeros(3), np.nan, np.nan, missing)
 
     @property
     def size(self) -> float:
-        """Of the force that is felt now [N]; NaN if there is none."""
+        """Return the size of the present force [N]; NaN if there is none."""
         return np.nan if self.missing else float(np.linalg.norm(self.force))
 
 
 class PeriodChooser:
-    """Takes each period that could be shown, and says what is; of all tools, in their order.
+    """Chooser of the period to show, for all tools in their order.
 
-    is_unknown : the step computed no force for a tool
+    is_unknown : whether the step computed no force for a tool
     """
 
     def __init__(self) -> None:
-        self._valid: tuple[ShownPeriod, ...] = ()  # the last with a force, while a tool is in
+        # the last period with a force, while a tool is in contact
+        self._valid: tuple[ShownPeriod, ...] = ()
         self.is_unknown = False
 
     def forget(self) -> None:
-        """Another organ, or other tools: nothing of the last one is held."""
+        """Forget the last organ or tools."""
         self._valid, self.is_unknown = (), False
 
     def take(self, rows: np.ndarray) -> bool:
-        """Whether the cloud of a period is to be drawn; ``rows`` as in the shared memory."""
+        """Return whether the cloud of a period is to be drawn; ``rows`` as in the shared memory."""
         self.is_unknown = not has_force(rows["status"]).all()
         is_held = self.is_unknown and bool(self._valid)
         if not is_held:
-            self._valid = ()  # until it is known what is drawn
+            self._valid = ()  # until the drawn period is known
         return not is_held
 
     def drawn(self, rows: np.ndarray, largest: float, sent: np.ndarray) -> tuple[ShownPeriod, ...]:
-        """What is shown, once the cloud was drawn or left as it was.
+        """Return the numbers to show, once the cloud was drawn or left as it was.
 
-        largest : displacement of the cloud, if it was drawn [m]
-        sent : poses that were sent last, for periods whose step did not use one, (n_tools, 3) [m]
+        largest : largest displacement of the cloud, if it was drawn [m]
+        sent : poses sent last, (n_tools, 3) [m], for periods whose step did not use one
         """
         used = rows["tip"]
         is_placed = np.isfinite(used).all(axis=1) & (np.abs(used) < PLACE).all(axis=1)
@@ -103,12 +105,12 @@ class PeriodChooser:
 
 
 def has_force(status: np.ndarray) -> np.ndarray:
-    """Whether the step computed the force of each tool; status : shape (n_tools,)"""
+    """Return whether the step computed the force of each tool; status : shape (n_tools,)."""
     return np.isin(status, PLACED) & (status != ContactState.STATUS_OUT_OF_RANGE)
 
 
 def why_missing(status: np.ndarray) -> list[str]:
-    """Why each tool shows no force where one of them has none; status : shape (n_tools,)"""
+    """Return why each tool shows no force where one has none; status : shape (n_tools,)."""
     known = zip(status.tolist(), has_force(status), strict=True)
     return [OTHER_UNKNOWN if is_known else explanation(number) for number, is_known in known]
 

@@ -16,11 +16,11 @@ from avatar_ros.msg import ContactState
 from avatar_ros.ui.session.requests import START
 from avatar_ros.ui.session.shown_period import OTHER_ORGAN, ShownPeriod
 
-_MANY_MISSED = 0.02  # part of the periods that may come late without a word
-BAND = "90 % of what is known of the material"
-# The error beside the force covers the reduction; material and mesh are taken as they are.
-COVERS = "±: nine touches in ten are closer to finite elements"
-# How a cell gets so many tools.
+_MANY_MISSED = 0.02  # fraction of the periods that may come late without a message
+BAND = "90 % range for the uncertain material"
+# the error beside the force covers the reduction; material and mesh are taken as exact
+COVERS = "± covers nine touches in ten, against finite elements"
+# how to start a cell with this number of tools
 _EXAMPLES = {
     1: "one tool (`avatar cell` without `--tools`)",
     2: "two tools (`avatar cell --tools left,right`)",
@@ -29,7 +29,7 @@ NO_ORGAN = "no organ yet: choose a vademecum under Organ"
 
 
 def of_tools(lines: Iterable[Sequence[str]], labels: Sequence[str]) -> list[str]:
-    """Lines of each tool with its label before them; what is said of all tools, once without."""
+    """Return lines of each tool after its label; lines that all tools share once, without label."""
     tools: dict[str, list[str]] = {}
     for label, own in zip(labels, lines, strict=True):
         for line in own:
@@ -47,11 +47,11 @@ def warnings(
     labels: Sequence[str] = ("",),
     missed: float = 0.0,
 ) -> str:
-    """Everything that keeps the page from working, one line each; a single one if nothing does.
+    """Return all that keeps the page from working, one line each; a single line if nothing does.
 
-    statuses : of the last period, of each tool; none if none came lately
-    labels : of the tools
-    missed : part of the loop's periods that came late, of the last second
+    statuses : status of each tool in the last period; empty if none came lately
+    labels : labels of the tools
+    missed : fraction of the loop's periods that came late in the last second
     """
     lines = [_sentence(START[name]) for name in missing if name != "patient_interpolation"]
     if not has_organ and "vademecum_loader" not in missing:
@@ -71,21 +71,21 @@ def warnings(
 
 
 def _why(status: int, has_organ: bool) -> list[str]:
-    """Cause and remedy of a status in a line; none if it needs none."""
+    """Return cause and remedy of a status in a line; none if it needs none."""
     if status == ContactState.STATUS_NO_MODEL and has_organ:
         return [_sentence(OTHER_ORGAN)]
     return [_sentence(explanation(status))] if status in EXPLANATIONS else []
 
 
 def _sentence(line: str) -> str:
-    """With a capital letter, and one mark at its end."""
+    """Return a line with a capital letter, and one mark at its end."""
     return f"{line[0].upper()}{line[1:].rstrip('.')}" + ("" if line.endswith("?") else ".")
 
 
 def frame_text(shown: ShownPeriod, material: str, n_kept: int | None, label: str = "") -> list[str]:
-    """The numbers of a frame, as lines of HTML.
+    """Return the numbers of a frame, as lines of HTML.
 
-    material : that is in force; n_kept : recorded periods, or None; label : of the tool
+    material : material in force; n_kept : recorded periods, or None; label : of the tool
     """
     force = float(np.linalg.norm(shown.force))
     error = f"± {shown.error:.2f} N" if np.isfinite(shown.error) else "(error unknown)"
@@ -114,14 +114,14 @@ def frame_text(shown: ShownPeriod, material: str, n_kept: int | None, label: str
 
 
 def plain(line: str) -> str:
-    """A line without its marks of HTML."""
+    """Return a line without its HTML tags."""
     return re.sub("</?(b|small)>", "", line)
 
 
 def recorded_text(recording: Recording) -> str:
-    """How much of the time was recorded."""
+    """Describe how much of the time was recorded."""
     n, lost = len(recording.periods), int(recording.periods.lost.sum())
-    # With several tools the loop may step more often than at its rate: at each one's pose.
+    # with several tools the loop may step more often than at its rate: at each tool's pose
     expected = max(round(recording.seconds * recording.rate) + 1, n + lost)
     late = expected - n - lost
     text = f"recorded {recording.seconds:.1f} s, {n:,} of {expected:,} periods"
@@ -131,7 +131,7 @@ def recorded_text(recording: Recording) -> str:
 
 
 def scene_texts(n_tools: int) -> dict[str, str]:
-    """The descriptions of the shipped scenes for so many tools, with their effects, as Markdown."""
+    """Return descriptions of the shipped scenes for n tools, with their effects, as Markdown."""
     texts = {}
     for name, scene in _shipped().items():
         if len(scene.tools) == n_tools:
@@ -141,7 +141,7 @@ def scene_texts(n_tools: int) -> dict[str, str]:
 
 
 def other_scenes(n_tools: int) -> str:
-    """What to do for the shipped scenes of other numbers of tools, as Markdown."""
+    """Describe how to get the shipped scenes of other numbers of tools, as Markdown."""
     others: dict[int, list[str]] = {}
     for name, scene in _shipped().items():
         if len(scene.tools) != n_tools:

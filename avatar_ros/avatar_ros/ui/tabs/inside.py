@@ -1,4 +1,4 @@
-"""What lies inside the organ: name, visibility, colour and opacity of each structure."""
+"""Structures inside the organ: name, visibility, colour and opacity of each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measuring: what a click on the organ places, and the numbers of all that was placed."""
+"""Measuring: kind of place that a click adds, and the numbers of all places."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from avatar_ros.ui.measure.measures import PLANE, PROBE, RULER, TOOL, Measures
 
 
 class MeasureTab:
-    """Choice of what a click places, and a list of numbers."""
+    """Choice of the places that clicks add, and a list of numbers."""
 
     def __init__(self, gui: Any, measures: Measures) -> None:
         mode = gui.add_dropdown("A click places", (TOOL, PROBE, RULER, PLANE))

@@ -1,4 +1,4 @@
-"""The organ: which file, how it is looked at, and its material."""
+"""The organ: its file, its look, and its material."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _ABOUT = "margin:0 1em;font-size:14px;line-height:1.5"
 class OrganTab:
     """Choice of the vademecum, of the look, and sliders of the material.
 
-    load : loads a file of the library; mark_reach : draws a pattern where tools reach, or none
+    load : loads a file of the library; mark_reach : draws or hides the pattern where tools reach
     store : takes name and content of a file that a browser sends
     """
 
@@ -68,7 +68,7 @@ class OrganTab:
             self._source = gui.add_markdown("")
 
     def offer(self, files: list[str], damaged: list[str]) -> None:
-        """Offer the files of the library, and say in a line each why others are not."""
+        """Offer the files of the library, with a line on each file that cannot be used."""
         set_options(self._files, files)
         set_options(self._colour, list(self._coloured.fields))
         lines = "".join(f'<div style="{_ABOUT}">⚠ {escape(line)}</div>' for line in damaged)
@@ -93,8 +93,8 @@ class OrganTab:
         with self._material:
             for name, (low, high, here) in organ.ranges.items():
                 label, unit = SLIDERS[name]
-                if name == "young" or name.startswith(SUPPORT):  # over orders of magnitude
-                    # without bounds, at which a browser would take another number unasked
+                if name == "young" or name.startswith(SUPPORT):  # ranges over orders of magnitude
+                    # without bounds, at which a browser would choose another number by itself
                     add = partial(self._gui.add_number, step=0.1)
                 else:
                     bounds = {"min": round(low / unit, 6), "max": round(high / unit, 6)}
@@ -125,7 +125,7 @@ class OrganTab:
                 self._sliders[name].value = round(shown, 6)
 
     def _on_slider(self, name: str, unit: float, bounds: tuple[float, float], event: Any) -> None:
-        if event.client is None:  # not moved by a user, but by show_material
+        if event.client is None:  # moved by show_material, not by a user
             return
         self._no_preset()
         value = event.target.value * unit
@@ -133,7 +133,7 @@ class OrganTab:
         self._chosen.choose_material({name: within if np.isclose(value, within) else value})
 
     def _no_preset(self) -> None:
-        """The material is that of no source."""
+        """Show that the material comes from no preset."""
         self._preset.value, self._source.content = _NO_PRESET, ""
 
     def _on_preset(self, event: Any) -> None:

@@ -1,4 +1,4 @@
-"""A new patient: from which surface and label, how it is held, how exactly, and how far it is."""
+"""A new patient: surface and labels, supports, accuracy, and progress of the build."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from avatar_ros.ui.view.legend import key_of_access, key_of_clamp, key_of_missed
 
 ORGAN, INSIDE = "organ", "inside it"
 ROLES = (NOTHING, ORGAN, INSIDE)
-_HINT = "several may make up the organ; what is inside is shown, and is as stiff as the organ"
+_HINT = (
+    "several labels can form the organ; structures inside are shown, and are as stiff as the organ"
+)
 UNITS = ("mm", "cm", "m")
 STATED = "as the file states, else RAS"
 AXES = (STATED, "RAS", "LPS", "LAS", "RPS")
@@ -24,14 +26,14 @@ FIDELITIES = ("interpolated", "reduced", "solved")
 CLAMPED, SPRUNG = "clamp of the template", "springs where it is attached"
 GUESS, FREE = "a guess", "free"
 SPRINGS = (GUESS, FREE, *(f"1e{k}" for k in range(3, 11)), "clamped")  # [N/m^3]
-BRUSH_RADIUS = (4.0, 40.0, 12.0)  # least, most, first [mm]
+BRUSH_RADIUS = (4.0, 40.0, 12.0)  # smallest, largest, first [mm]
 _SECTION = "margin:0 1em;font-size:13px"
 
 
 class PatientTab:
     """Controls of a build and its progress.
 
-    load : loads a file of the library; brushes : what a click on a preview can paint
+    load : loads a file of the library; brushes : regions that a click on a preview can paint
     """
 
     def __init__(
@@ -51,8 +53,8 @@ class PatientTab:
         self._first = gui.add_checkbox(
             "Interpolate first",
             initial_value=False,
-            hint="an interpolated organ in seconds, replaced by the better one when that is there; "
-            "with the clamp of the template alone",
+            hint="an interpolated organ in seconds, replaced by the better one when ready; "
+            "only with the clamp of the template",
         )
         self._held = gui.add_dropdown("Held by", (CLAMPED, SPRUNG))
         self._stiffness = gui.add_folder("Stiffness per area [N/m\u00b3]", visible=False)
@@ -90,7 +92,7 @@ class PatientTab:
         self._cancel = gui.add_button("Cancel", visible=False)
         self._cancel.on_click(lambda _: new.cancel())
         self._built = ""
-        self._use = gui.add_button("", visible=False, hint="in place of the organ in use")
+        self._use = gui.add_button("", visible=False, hint="replaces the organ in use")
         self._use.on_click(lambda _: self._on_use())
         self._is_first_used = False
         self._began = {"": 0.0}
@@ -104,7 +106,7 @@ class PatientTab:
             self._new.build(self._wanted(preview))
 
     def _named(self, role: str) -> tuple[str, ...]:
-        """Labels of a role."""
+        """Return the labels of a role."""
         return tuple(name for name, one in self._roles.items() if one.value == role)
 
     def _wanted(self, preview: bool = False) -> Wanted:
@@ -139,11 +141,11 @@ class PatientTab:
         set_options(self._surfaces, [NOTHING, *surfaces])
 
     def _on_surface(self) -> None:
-        self.offer_labels(())  # none of the last file
+        self.offer_labels(())  # removes those of the last file
         self._new.choose_surface(self._surfaces.value)
 
     def offer_labels(self, labels: tuple[str, ...]) -> None:
-        """Offer a role for each label of the chosen file, none for one that is no label map."""
+        """Offer a role for each label of the chosen file, none for a file that is no label map."""
         for role in self._roles.values():
             role.remove()
         only = ORGAN if len(labels) == 1 else NOTHING
@@ -153,10 +155,10 @@ class PatientTab:
                 for name in labels
             }
         self._labels.visible = bool(labels)
-        self._unit.visible = self._axes.visible = not labels  # which a label map states
+        self._unit.visible = self._axes.visible = not labels  # a label map states them
 
     def show_preview(self, is_shown: bool, springs: Mapping[str, float] | None = None) -> None:
-        """Show the controls of a preview, or hide them.
+        """Show or hide the controls of a preview.
 
         springs : area of each [m^2]; they can be painted too
         """
@@ -170,11 +172,11 @@ class PatientTab:
 
     def _on_use(self) -> None:
         self._use.visible = False
-        self._is_first_used = self._progress.visible  # the better one is still being built
+        self._is_first_used = self._progress.visible  # the better organ is still being built
         self._load(self._built)
 
     def begin(self) -> None:
-        """A build or a preview begins; it can be cancelled."""
+        """Show that a build or a preview begins; it can be cancelled."""
         self._is_first_used = False
         self._use.visible = False
         self._progress.visible = self._cancel.visible = True
@@ -185,9 +187,9 @@ class PatientTab:
         self._built, self._use.label, self._use.visible = file, f"Use {file} so far", True
 
     def end(self, how: str, file: str = "") -> None:
-        """A build or a preview has ended; the file that was built is offered.
+        """Show that a build or a preview has ended, and offer the file that was built.
 
-        Where the interpolated one is in use, the better one takes its place.
+        If the interpolated organ is in use, the better one takes its place.
         """
         self._progress.visible = self._cancel.visible = False
         self._stage.content = how
@@ -197,14 +199,14 @@ class PatientTab:
             self._load(file)
 
     def show_progress(self, stage: str, fraction: float, error: float) -> None:
-        """Show how far a stage is, and how long it takes yet at this pace."""
+        """Show the progress of a stage, and its remaining time at this pace."""
         now = time.monotonic()
         if stage not in self._began:
             self._began = {stage: now}
         spent = now - self._began[stage]
         left = f", {spent / fraction - spent:.0f} s left" if 0.05 < fraction < 1.0 else ""
         known = "" if np.isnan(error) else f", expected error {error:.1%}"
-        part = f": {fraction:.0%}" if fraction > 0.0 else ""  # of some stages, none is known
+        part = f": {fraction:.0%}" if fraction > 0.0 else ""  # some stages have none
         self._stage.content = f"{stage}{part}{left}{known}"
         self._progress.animated = fraction <= 0.0
         self._progress.value = float(np.clip(100.0 * fraction, 0.0, 100.0)) or 100.0

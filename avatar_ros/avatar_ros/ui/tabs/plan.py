@@ -1,4 +1,4 @@
-"""The plan: states that are kept, a report of them, and surfaces to take away."""
+"""The plan: kept states, a report of them, and export of surfaces."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FORMATS = (".stl", ".vtp", ".obj")
 
 
 class PlanTab:
-    """Controls of what is kept."""
+    """Controls of the kept states."""
 
     def __init__(self, gui: Any, plan: Plan, chosen: Chosen) -> None:
         self._plan = plan
@@ -32,7 +32,7 @@ class PlanTab:
             lambda _: plan.export(self._format.value)
         )
         gui.add_button(
-            "Write the cut as a resection", hint="a plane, for a new vademecum"
+            "Write the cut as a resection", hint="the plane of the cut, to build a new vademecum"
         ).on_click(lambda _: plan.resect())
         gui.add_markdown("Surfaces are in mm and LPS, as 3D Slicer takes them.")
 

@@ -1,4 +1,4 @@
-"""Recordings: which one is played, and where in it."""
+"""Recordings: choice, and position in time."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class RecordingsTab:
         set_options(self._files, recordings[::-1])
 
     def show(self, part: float) -> None:
-        """Show how far it is, 0 to 1."""
+        """Show the played fraction, 0 to 1."""
         value = round(100.0 * part, 1)
         if self._time.value != value:
             self._time.value = value

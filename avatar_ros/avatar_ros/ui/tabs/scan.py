@@ -1,4 +1,4 @@
-"""An image beside the organ: which file, where its planes lie, and its grey scale."""
+"""An image beside the organ: its file, position of its planes, and grey scale."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from avatar_ros.ui.tabs.choices import set_options
 NONE = "none"
 ALL = "all planes"
 _UNDEFORMED = (
-    "The image stays as it was taken. Lines are where its planes cut the organ (blue) and what is "
+    "The image is not deformed. Lines show where its planes cut the organ (blue) and structures "
     "in it (orange) now."
 )
 _AS_RADIOLOGISTS = (
@@ -42,7 +42,7 @@ class ScanTab:
             self._view.choose("" if file == NONE else file)
 
     def show_scan(self, scan: Scan | None, file: str) -> None:
-        """Controls of the image of a file; None while none is drawn."""
+        """Show the controls of a file's image; None while none is drawn."""
         for control in self._shown:
             control.remove()
         self._shown = []

@@ -1,4 +1,4 @@
-"""The scene: which effects are simulated."""
+"""The scene: choice of the simulated effects."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _IN_USE = "margin:0 1em;font-size:14px"
 
 
 class SceneTab:
-    """Choice of a scene, with what it simulates."""
+    """Choice of a scene, with its effects."""
 
     def __init__(self, gui: Any, chosen: Chosen) -> None:
         self._in_use = gui.add_html("")
@@ -26,13 +26,13 @@ class SceneTab:
         self._texts: dict[str, str] = {}
 
     def show_scene(self, name: str) -> None:
-        """Say which scene is in use."""
+        """Show which scene is in use."""
         content = f'<div style="{_IN_USE}">In use: <b>{escape(name)}</b></div>'
         if self._in_use.content != content:
             self._in_use.content = content
 
     def offer(self, n_tools: int) -> None:
-        """Offer the scenes of a cell of so many tools, and say how to come to the others."""
+        """Offer the scenes for n tools, and describe how to get the others."""
         self._texts, self._others.content = scene_texts(n_tools), other_scenes(n_tools)
         set_options(self._scenes, list(self._texts))
         self._describe()

@@ -1,4 +1,4 @@
-"""The tool: what it feels, how it is moved, and what is recorded of it."""
+"""The tool: force on it, its motion, and recording."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from avatar_ros.ui.tabs.choices import NOTHING, set_options
 from avatar_ros.ui.tools.tools import Tools
 from avatar_ros.ui.view.orientation import AXES
 
-STEP = 1e-3  # of a key [m]
-_HISTORY = 10.0  # of the plot [s]
-_LEAST_RANGE = 1.0  # of the plot [N]
+STEP = 1e-3  # way of a key [m]
+_HISTORY = 10.0  # length of the plot [s]
+_LEAST_RANGE = 1.0  # smallest range of the plot [N]
 _PADDING = (14, 22, 0, 0)  # so that no number on an axis is cut [px]
-# Keys, what they do, and the side of the patient to which they move the tool; "": the normal.
+# keys, their function, and the side of the patient to which they move the tool; "": the normal
 KEYS = {
     "J": ("Tool to the patient's right", "R"),
     "L": ("Tool to the patient's left", "L"),
@@ -34,7 +34,7 @@ KEYS = {
 
 
 def _plot_of_force(gui: Any, has_band: bool) -> Any:
-    """The force with its error, and with the band of what is known of the material or without."""
+    """Plot the force with its error, with or without the band from the material's distributions."""
     curves = [
         uplot.Series(label="force [N]", stroke="#0072B2", width=2),
         uplot.Series(label="at least [N]", stroke="#D55E0080", width=1),
@@ -49,7 +49,7 @@ def _plot_of_force(gui: Any, has_band: bool) -> Any:
         bands.append(uplot.Band(series=(5, 4), fill="#009E7320"))
     values = {
         "min": {"pad": 0, "soft": 0, "mode": 1},
-        "max": {"pad": 0.1, "soft": _LEAST_RANGE, "mode": 1},  # rest is a line at the bottom
+        "max": {"pad": 0.1, "soft": _LEAST_RANGE, "mode": 1},  # zero force is a line at the bottom
     }
     return gui.add_uplot(
         tuple(np.zeros(2) for _ in range(1 + len(curves))),
@@ -75,14 +75,17 @@ class ToolTab:
         n = round(_HISTORY * 5)
         self._times: deque[float] = deque(maxlen=n)
         self._forces: deque[tuple[float, float, float]] = deque(maxlen=n)
-        self._bands: deque[tuple[float, float]] = deque(maxlen=n)  # the force, where it has none
+        # the force, where there is no band
+        self._bands: deque[tuple[float, float]] = deque(maxlen=n)
         self._plot, self._plot_of_band = _plot_of_force(gui, False), _plot_of_force(gui, True)
         self._plot_of_band.visible = False
         for name, labels in (("Depth", ("press 1 mm", "lift 1 mm")), ("1 mm to", tuple(AXES))):
             group = gui.add_button_group(name, labels)
             group.on_click(lambda event: self._nudge(event.target.value))
         gui.add_button("Lift off the organ").on_click(lambda _: tools.lift())
-        jaw = gui.add_button("Close or open the jaw", hint="of a tool that a scene gives one")
+        jaw = gui.add_button(
+            "Close or open the jaw", hint="for a tool to which the scene gives a jaw"
+        )
         jaw.on_click(lambda _: tools.work_jaw())
         self._recording = gui.add_button("Record", hint="poses, forces and shapes, from rest")
         self._recording.on_click(lambda _: recordings.record(self._recording.label == "Record"))
@@ -99,7 +102,7 @@ class ToolTab:
     def show_tools(self, names: Sequence[str], chosen: str) -> None:
         """Offer the tools, if there are several, and show which one is chosen."""
         set_options(self._tools, list(names))
-        if chosen != self._chosen:  # the list may be ahead, of a choice that is on its way
+        if chosen != self._chosen:  # the list may show a newer choice, still on its way
             self._chosen = self._tools.value = chosen
             self.forget_force()  # of another tool
         if self._tools.visible != (len(names) > 1):
@@ -120,7 +123,7 @@ class ToolTab:
         self._moved.nudge(AXES[side] if side else None, way)
 
     def show_period(self, shown: ShownPeriod | None) -> None:
-        """Add the force of a period to the plot; a gap where none is known or nothing is of now."""
+        """Add the force of a period to the plot; a gap if it is unknown or not the present one."""
         if shown is None or shown.missing:
             self.forget_force()
         else:
@@ -132,8 +135,7 @@ class ToolTab:
     ) -> None:
         """Add a point to the plot [s, N]; five per second are enough.
 
-        band : low and high edge of what is known of the force [N]; the plot shows it for as long as
-            one of its points has one
+        band : low and high edge of the force's band [N]; shown while any point of the plot has one
         """
         self._times.append(now)
         self._forces.append((force, max(force - error, 0.0), force + error))
@@ -149,10 +151,10 @@ class ToolTab:
             shown.visible, hidden.visible = True, False
 
     def forget_force(self) -> None:
-        """No force is known: the next one begins another curve, not joined to the last."""
+        """Begin another curve at the next known force, not joined to the last."""
         for history in (self._times, self._forces, self._bands):
             history.clear()
 
     def show_recording(self, is_on: bool) -> None:
-        """Label the button with what it does next."""
+        """Label the button with its next function."""
         self._recording.label = "Stop and save" if is_on else "Record"

@@ -1,4 +1,4 @@
-"""The last changes that a user made on the planning page, to be undone."""
+"""The last changes that a user made on the planning page, for undo."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from threading import Lock
 from typing import NamedTuple
 
 _MOST = 100
-_TOGETHER = 1.0  # changes of one kind that follow each other so soon are one [s]
+_TOGETHER = 1.0  # changes of one kind within this time count as one [s]
 
 
 class _Change(NamedTuple):
@@ -19,7 +19,7 @@ class _Change(NamedTuple):
 
 
 class History:
-    """Changes with what takes each back."""
+    """Changes, each with a function that undoes it."""
 
     def __init__(self) -> None:
         self._changes: deque[_Change] = deque(maxlen=_MOST)
@@ -27,7 +27,7 @@ class History:
         self._lock = Lock()
 
     def note(self, kind: str, what: str, back: Callable[[], None]) -> None:
-        """Remember a change; of a drag, only where it began."""
+        """Note a change; for a drag, only its begin."""
         now = time.monotonic()
         with self._lock:
             same = bool(self._changes) and self._changes[-1].kind == kind
@@ -36,7 +36,7 @@ class History:
             self._last = now
 
     def undo(self) -> str:
-        """Take the last change back; returns what it was, empty if there is none."""
+        """Undo the last change; return its name, empty if there is none."""
         with self._lock:
             change = self._changes.pop() if self._changes else None
             self._last = 0.0
@@ -46,6 +46,6 @@ class History:
         return change.what
 
     def forget(self) -> None:
-        """Another organ: nothing of the last one can be undone."""
+        """Forget all changes: they belong to another organ."""
         with self._lock:
             self._changes.clear()

@@ -1,11 +1,11 @@
-"""Drives the tools of the planning page: 1,000 poses a second, each towards its own target.
+"""Driver of the planning page's tools: 1,000 poses a second, each towards its own target.
 
-It is a process of its own, because the page is served in bursts. It reads every state that the
+It runs in a separate process, because the page is served in bursts. It reads every state that the
 contact node answers, and on request records it with the pose that the step used.
 
 Run as ``python -m avatar_ros.ui.tools.tool_driver FRAME ALL TOOL ...`` by ``planning_ui``, never by
-hand: ALL are the names of the contact node's tools, with commas, the others those of them that are
-to be moved, in the same order. The shared memory comes as standard input.
+hand. ALL are the names of the contact node's tools, with commas. The other names are those to be
+moved, in the same order. The shared memory comes as standard input.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from avatar_ros.msg import ContactState
 from avatar_ros.ui.tools.tool_state import N_RECENT, N_ROWS, ROW, SharedToolState, organ_number
 
 PERIOD = 1_000_000  # [ns]
-_APPROACH = 0.04  # part of the remaining distance moved in a period: lags the mouse by 25 ms
-_MAX_STEP = 0.5e-3  # in a period [m]
+_APPROACH = 0.04  # fraction of the remaining distance moved in a period: lags the mouse by 25 ms
+_MAX_STEP = 0.5e-3  # largest way in a period [m]
 _N_SENT = 4096  # recent poses of each tool, one of which a state answers
 _LATE = 20 * PERIOD  # delay from which missed poses are skipped
-# Of each tool, deeper than the publisher's queue: a recording that lost periods is no path.
+# deeper than the publisher's queue, for each tool: a recording with lost periods is no path
 _N_STATES = 200
-_JAW_EVERY = 20  # periods; and at once when it closes or opens
+_JAW_EVERY = 20  # periods between messages of the jaw, besides each change
 _OPEN = 0.5  # position of an open jaw [rad]
 
 
@@ -78,7 +78,7 @@ class ToolDriver:
         self._periods = PeriodCollector(tools, all_tools, state, self._used)
 
     def run(self, stop: StopSignal) -> None:
-        """Run until the signal comes."""
+        """Run until a signal comes."""
         offset = time.time_ns() - time.monotonic_ns()
         tick = time.monotonic_ns() + PERIOD
         self._first = tick + offset
@@ -104,7 +104,7 @@ class ToolDriver:
         self._tips += steps * (_MAX_STEP / np.maximum(lengths, _MAX_STEP))
 
     def _publish(self, stamp: bytes) -> None:
-        """One pose of each tool, close after one another: the contact loop wakes at the first."""
+        """Publish one pose of each tool, close together: the contact loop wakes at the first."""
         messages = []
         for tip in self._tips:
             self._pose.position[:] = tip
@@ -113,7 +113,7 @@ class ToolDriver:
             publisher.handle.publish_raw(message)
 
     def _work_jaws(self, number: int) -> None:
-        """Say of each jaw now and then whether it is closed, and at once if that changes."""
+        """Publish now and then, and at each change, whether each jaw is closed."""
         for tool, publisher in enumerate(self._jaws):
             shut = int(self._each["shut"][tool])
             if shut == self._shut[tool] and number % _JAW_EVERY:
@@ -122,7 +122,7 @@ class ToolDriver:
             publisher.publish(JointState(name=["jaw"], position=[0.0 if shut else _OPEN]))
 
     def _used(self, tool: int, status: int, stamp: int) -> Any:
-        """Position of a tip that the step used [m]."""
+        """Return the position of a tip that the step used [m]."""
         if status == ContactState.STATUS_INVALID_POSE:
             return np.nan
         if status not in PLACED:
@@ -131,13 +131,14 @@ class ToolDriver:
 
 
 class PeriodCollector:
-    """Collects the states of the tools of a period, and writes it once it is whole.
+    """Collects the states of the tools of a period, and writes it once it is complete.
 
     The contact node sends the states of a step in the order of all its tools, from one publisher.
-    The publisher's count therefore tells which states are of one step, although the poses that they
-    answer may be of two: one may have come too late for its step.
+    The publisher's count therefore tells which states belong to one step. The poses that they
+    answer
+    may belong to two, because one may have come too late for its step.
 
-    used : position of the tip that a step used [m], of a tool, a status and a stamp [ns]
+    used : returns the tip that a step used [m], for a tool, a status and a stamp [ns]
     """
 
     def __init__(
@@ -152,15 +153,15 @@ class PeriodCollector:
         self._all, self._recent, self._rows = state.all, state.recent, state.rows
         self._used = used
         self._period = np.zeros(len(tools), ROW)
-        self._first = -1  # count of the first of all states of the period that is collected
+        self._first = -1  # count at the first state of the period that is collected
         self._n_missing = 0
 
     def note(self, state: Any, number: int) -> None:
-        """A state, and the number that its publisher gave it."""
+        """Note a state with its publisher's sequence number."""
         if state.tool not in self._places:
             return
         tool, before = self._places[state.tool]
-        if number - before != self._first:  # another step; what is missing of the last one is lost
+        if number - before != self._first:  # another step; missing states of the last one are lost
             self._first, self._n_missing = number - before, len(self._places)
         self._read(tool, state)
         self._n_missing -= 1
@@ -197,6 +198,7 @@ class PeriodCollector:
 
 
 def main() -> int:
+    """Drive the tools as the command line asks; return the exit code."""
     frame, names, *tools = sys.argv[1:]
     stop = StopSignal()
     state = SharedToolState(sys.stdin.fileno(), len(tools))

@@ -1,7 +1,7 @@
-"""The process that drives the tools of the planning page, and the memory it shares with the node.
+"""The process that drives the planning page's tools, and the memory it shares with the node.
 
-Each field is written by one side and read by the other: the node writes the targets and whether to
-record, the driver writes where the tools are, the recorded periods and the recent ones. A period
+Each field is written by one side and read by the other. The node writes the targets and whether to
+record. The driver writes where the tools are, the recorded periods and the recent ones. A period
 has a row for each tool, all of one step of the contact loop. The driver increases the number of
 rows after it has written those of all tools; the stamps of recent ones are written last.
 """
@@ -20,15 +20,16 @@ from avatar_core.common.child import Child
 from avatar_core.geometry.tip import MAX_TOOLS
 from avatar_ros.framework import realtime
 
-SECONDS = 600  # of a recording, at most
+SECONDS = 600  # longest recording
 N_ROWS = SECONDS * 1000
-_STOP_TIMEOUT = 5.0  # for the driver [s]
+_STOP_TIMEOUT = 5.0  # time for the driver to end [s]
 N_RECENT = 512  # periods that are kept to be shown with the cloud of the same period
 
 ALL = np.dtype(
     [
         ("recording", np.int64),  # from the node
-        ("heard", np.int64),  # from the driver: when the last period came, monotonic clock [ns]
+        # from the driver: arrival of the last period on the monotonic clock [ns]
+        ("heard", np.int64),
         ("n_poses", np.int64),  # sent, of each tool
         ("n_rows", np.int64),
         ("n_recent", np.int64),  # periods received
@@ -38,8 +39,8 @@ ALL = np.dtype(
 EACH = np.dtype(
     [
         ("target", np.float64, 3),  # from the node: centre of the tip [m]
-        ("shut", np.int64),  # and whether its jaw is closed
-        ("tip", np.float64, 3),  # from the driver: as sent last [m]
+        ("shut", np.int64),  # whether its jaw is closed, also from the node
+        ("tip", np.float64, 3),  # from the driver: position sent last [m]
     ],
     align=True,
 )
@@ -54,24 +55,25 @@ ROW = np.dtype(
         ("status", np.int64),  # of avatar_ros/msg/ContactState
         ("touches", np.int64),
         ("held", np.int64),  # whether its jaw holds tissue
-        ("organ", np.uint64),  # that the contact node used, by :func:`organ_number`
+        # of the vademecum that the contact node used, by :func:`organ_number`
+        ("organ", np.uint64),
     ],
     align=True,
 )
 
 
 def organ_number(identity: str) -> int:
-    """The first 64 bits of a vademecum's id, 0 of none."""
+    """Return the first 64 bits of a vademecum's id, 0 without one."""
     return int(identity[:16] or "0", 16)
 
 
 class SharedToolState:
     """The shared memory as arrays.
 
-    There is room for as many tools as an organ takes; what is never written takes no memory.
+    There is room for as many tools as an organ allows; parts that are never written take no memory.
 
-    n_tools : of the cell, whose rows are read and written
-    all : what all tools share, of one entry
+    n_tools : number of the cell's tools, whose rows are read and written
+    all : fields that all tools share, one entry
     """
 
     def __init__(self, handle: int, n_tools: int = 1) -> None:
@@ -94,26 +96,26 @@ class SharedToolState:
 
     @staticmethod
     def make() -> SharedToolState:
-        """New memory, all zero."""
+        """Make new memory, all zero."""
         return SharedToolState(os.memfd_create("avatar-tools", os.MFD_CLOEXEC))
 
     @property
     def each(self) -> np.ndarray:
-        """Where each tool is and is to go, shape (n_tools,)."""
+        """Return position and target of each tool, shape (n_tools,)."""
         return self._each[: self.n_tools]
 
     @property
     def recent(self) -> np.ndarray:
-        """The recent periods in turn, shape (n_tools, N_RECENT)."""
+        """Return the recent periods in turn, shape (n_tools, N_RECENT)."""
         return self._recent[: self.n_tools]
 
     @property
     def rows(self) -> np.ndarray:
-        """The recorded periods, shape (n_tools, N_ROWS)."""
+        """Return the recorded periods, shape (n_tools, N_ROWS)."""
         return self._rows[: self.n_tools]
 
     def use(self, targets: np.ndarray) -> None:
-        """Other tools, (n_tools, 3) [m], of which nothing was heard yet; while no driver runs."""
+        """Begin with other tools, (n_tools, 3) [m], without periods; while no driver runs."""
         self.n_tools = len(targets)
         self.each["target"] = targets
         self.each["shut"] = 0
@@ -122,15 +124,15 @@ class SharedToolState:
 
     @property
     def sent(self) -> np.ndarray:
-        """Where each tool was sent last, or is to begin; a copy, shape (n_tools, 3) [m]."""
+        """Return a copy of the positions sent last, or of the first targets, (n_tools, 3) [m]."""
         is_driven = int(self.all["n_poses"][0]) > 0
         return np.array(self.each["tip" if is_driven else "target"])
 
     def period(self, stamp: int | None = None) -> np.ndarray | None:
-        """A copy of the recent rows of a stamp of the first tool [ns], or else of the newest, shape
-        (n_tools,); None before the first.
+        """Return a copy of recent rows, shape (n_tools,); None before the first.
 
-        A cloud carries the stamp of the first tool in its period.
+        The rows are those of a stamp of the first tool [ns], which a cloud carries, or else the
+        newest.
         """
         n = int(self.all["n_recent"][0])
         if n == 0:
@@ -139,14 +141,13 @@ class SharedToolState:
         return self.recent[:, found[0] if len(found) else (n - 1) % N_RECENT].copy()
 
     def force_of(self, tool: int, stamp: int) -> float:
-        """Size of the organ's force on a tool in the recent period of a stamp [ns]; NaN if it is
-        not kept."""
+        """Return the size of a tool's force in the recent period of a stamp [ns]; else NaN."""
         recent = self.recent[tool]
         found = recent[recent["stamp"] == stamp]
         return float(np.linalg.norm(found["force"][0])) if len(found) else float("nan")
 
     def recorded(self, begin: int = 0) -> np.ndarray:
-        """A copy of the recorded rows from ``begin`` on, shape (n_tools, n)."""
+        """Return a copy of the recorded rows from ``begin`` on, shape (n_tools, n)."""
         return self.rows[:, begin : int(self.all["n_rows"][0])].copy()
 
 
@@ -163,10 +164,10 @@ class ToolDriverProcess:
     def ensure_running(self, tools: Sequence[str], all_tools: Sequence[str], frame_id: str) -> None:
         """Start the driver unless it runs; it continues from the targets in the shared memory.
 
-        tools : to be moved, some or all of the contact node's
+        tools : names of the tools to move, some or all of the contact node's
         """
         self._child.start(frame_id, ",".join(all_tools), *tools, stdin=self._state.handle)
 
     def end(self) -> None:
-        """End the driver; returns when it has ended."""
+        """End the driver; return when it has ended."""
         self._child.finish(_STOP_TIMEOUT, signal.SIGINT)

@@ -1,4 +1,4 @@
-"""The tools of the planning page: their names, where each is to go, and which one is chosen."""
+"""The tools of the planning page: names, targets, and the chosen one."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from avatar_ros.ui.tools.tool_state import SharedToolState
 from avatar_ros.ui.tools.way import LIFT, way_around, way_to
 from avatar_ros.ui.view.organ import Organ
 
-OVER = 2e-3  # from the surface to a tip that is put over it [m]
-_NEAR = 0.01  # from a place on the way, from which the next one is aimed at [m]
+OVER = 2e-3  # height over the surface of a tip that is put there [m]
+_NEAR = 0.01  # distance to a point of the way from which the next one is aimed at [m]
 
 
 class Tools:
-    """Those of the contact node, in its order; each change of a place can be undone.
+    """The tools of the contact node, in its order; each change of a place can be undone.
 
     Parameters
     ----------
-    state : where their places are
-    history : of the changes
-    organ : gives the one that is shown, None before the first
+    state : shared state of their places
+    history : history of the changes
+    organ : returns the organ that is shown, None before the first
 
     Attributes
     ----------
-    names : of all; none until the contact node was asked
-    chosen : place in the list of the one that keys and buttons move, and whose numbers are shown
+    names : names of all tools; none until the contact node was asked
+    chosen : index of the tool that keys and buttons move, and whose numbers are shown
     """
 
     def __init__(
@@ -38,50 +38,50 @@ class Tools:
         self._state, self._history, self._organ = state, history, organ
         self.names: tuple[str, ...] = ()
         self.chosen = 0
-        self._ways: dict[int, list[np.ndarray]] = {}  # places yet to pass, by tool
+        self._ways: dict[int, list[np.ndarray]] = {}  # points yet to pass, by tool
         self._lock = Lock()  # controls call in threads
-        state.use(np.zeros((1, 3)))  # so many are drawn until then
+        state.use(np.zeros((1, 3)))  # one tool is drawn until then
 
     @property
     def name(self) -> str:
-        """Of the chosen one; empty before the contact node was asked."""
+        """Return the chosen tool's name; empty before the contact node was asked."""
         return self.names[self.chosen] if self.names else ""
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Names where they have to be said: of one tool alone, it is not."""
+        """Return the names as labels: a single tool has none."""
         return self.names if len(self.names) > 1 else ("",)
 
     @property
     def label(self) -> str:
-        """Of the chosen one."""
+        """Return the chosen tool's label."""
         return self.labels[self.chosen]
 
     def use(self, names: Sequence[str], targets: np.ndarray) -> None:
-        """Other tools, and where they are to go, shape (n, 3) [m]; while no driver runs."""
+        """Begin with other tools and targets, shape (n, 3) [m]; while no driver runs."""
         self.names, self.chosen = tuple(names), 0
         self._ways = {}
         self._state.use(targets)
         self._history.forget()
 
     def choose(self, name: str) -> None:
-        """Choose one; a name that is none of theirs changes nothing."""
+        """Choose a tool; an unknown name changes nothing."""
         if name in self.names:
             self.chosen = self.names.index(name)
 
     @property
     def targets(self) -> np.ndarray:
-        """Where all are to go, shape (n, 3) [m]; a copy."""
+        """Return a copy of the targets, shape (n, 3) [m]."""
         return np.array(self._state.each["target"])
 
     def put_all(self, targets: np.ndarray) -> None:
-        """Send all to places, which cannot be undone, shape (n, 3) [m]."""
+        """Send all tools to places, shape (n, 3) [m]; this cannot be undone."""
         with self._lock:
             self._ways = {}
             self._state.each["target"] = targets
 
     def put(self, tool: int, target: np.ndarray) -> None:
-        """Send one to a place, not through the organ, which cannot be undone, shape (3,) [m]."""
+        """Send a tool to a place, shape (3,) [m], around the organ; this cannot be undone."""
         organ, here = self._organ(), self._state.sent[tool]
         self._follow(tool, [target] if organ is None else way_to(organ, here, target))
 
@@ -90,8 +90,10 @@ class Tools:
             self._state.each["target"][tool], self._ways[tool] = way[0], way[1:]
 
     def drag(self, tool: int, begin: np.ndarray, way: np.ndarray, along_shaft: bool) -> None:
-        """Choose a tool, and move it from where the drag began as the mouse went, or as far along
-        its shaft as the mouse went up; shape (3,) each [m]."""
+        """Choose a tool, and move it from the drag's begin as the mouse moved; shape (3,) each [m].
+
+        Along the shaft, the upward part of the mouse's way counts.
+        """
         organ = self._organ()
         if organ is None or not np.isfinite(way).all():
             return
@@ -113,13 +115,13 @@ class Tools:
             self._move([organ.lifted(self.targets[self.chosen], LIFT)], "lift")
 
     def work_jaw(self) -> None:
-        """Close the jaw of the chosen tool, or open it; nothing to it without one."""
+        """Close or open the jaw of the chosen tool, if it has one."""
         self._state.each["shut"][self.chosen] ^= 1
 
     def put_over(self, place: np.ndarray, normal: np.ndarray, offset: float) -> None:
         """Move the chosen tool over a clicked place of the surface, around the organ; [m].
 
-        offset : of the tip's lowest point from its pose [m]
+        offset : distance of the tip's lowest point from its pose [m]
         """
         organ, here = self._organ(), self._state.sent[self.chosen]
         if organ is not None:
@@ -127,7 +129,7 @@ class Tools:
             self._move(way_around(organ, here, there, normal), "click")
 
     def advance(self) -> None:
-        """Aim at the next place of each way that is gone; called for every frame."""
+        """Aim at the next point of each way whose last one was reached; called for every frame."""
         with self._lock:
             left = np.linalg.norm(self._state.sent - self._state.each["target"], axis=1)
             for tool, way in list(self._ways.items()):

@@ -7,16 +7,17 @@ import numpy as np
 from avatar_ros.ui.view.measuring import hit, is_within
 from avatar_ros.ui.view.organ import Organ
 
-LIFT = 0.03  # off the organ [m]
-_NEAR = 0.01  # distance of a place to which a tool goes straight, as it may through tissue [m]
-_AROUND = 0.02  # over the sphere around the organ [m]
-_TURN = np.radians(30.0)  # between two points of the arc, whose chord stays off the organ
+LIFT = 0.03  # height off the organ [m]
+_NEAR = 0.01  # distance of a place to which a tool goes straight, if need be through tissue [m]
+_AROUND = 0.02  # height over the sphere around the organ [m]
+# angle between two points of the arc, so that its chord stays off the organ
+_TURN = np.radians(30.0)
 
 
 def way_to(organ: Organ, here: np.ndarray, there: np.ndarray) -> list[np.ndarray]:
-    """Places to pass between two, the last of which is the second; each of shape (3,) [m].
+    """Return the points to pass from one place to another, ending there; each of shape (3,) [m].
 
-    The second alone where it is near, or no tissue lies between.
+    If the other place is near, or no tissue lies between, it is the only point.
     """
     if np.linalg.norm(there - here) < _NEAR or not _crosses(organ, here, there):
         return [there]
@@ -26,9 +27,9 @@ def way_to(organ: Organ, here: np.ndarray, there: np.ndarray) -> list[np.ndarray
 def way_around(
     organ: Organ, here: np.ndarray, there: np.ndarray, normal: np.ndarray
 ) -> list[np.ndarray]:
-    """As :func:`way_to`, but off the organ and down again in any case.
+    """Return a way as :func:`way_to`, but off the organ and down again in any case.
 
-    normal : of the surface under the second
+    normal : surface normal at the other place
     """
     up, down = organ.lifted(here, LIFT), there + LIFT * normal
     if not _crosses(organ, up, down):
@@ -48,7 +49,7 @@ def way_around(
 
 
 def _crosses(organ: Organ, begin: np.ndarray, end: np.ndarray) -> bool:
-    """Whether the straight way passes through the organ at rest."""
+    """Return whether the straight way passes through the organ at rest."""
     way, vertices = end - begin, organ.vertices
     met = hit(begin, way, vertices, organ.faces)
     if met is None:

@@ -1,4 +1,4 @@
-"""Triangles cut along the lines on which a field has given values."""
+"""Triangles cut along the level lines of a field."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 
 
 class Banded(NamedTuple):
-    """Triangles, none of which a line crosses.
+    """Triangles that no line crosses.
 
     points : ndarray, shape (n', d), the given ones first
-    faces : ndarray of int, shape (m', 3); band : (m',), of each, from 0
+    faces : ndarray of int, shape (m', 3); band : (m',), number of each face's band, from 0
     parent : (m',), the given face that each is a part of
     """
 
@@ -27,13 +27,13 @@ def cut(
     """Cut a surface along the values ``step``, 2 ``step``, ..., (n_bands - 1) ``step``.
 
     The field is linear on each triangle; its part between two levels is a polygon of at most five
-    corners: two on the side from the lowest corner to the highest, two on the way over the middle
-    corner, and that one, if it lies between.
+    corners. Two lie on the side from the lowest corner to the highest, and two on the way over the
+    middle corner. The fifth is the middle corner, if it lies between the levels.
 
     Parameters
     ----------
     points : ndarray, shape (n, d); values : ndarray, shape (n,); faces : ndarray, shape (m, 3)
-    step : between two values; n_bands : the last of which has no end
+    step : between two values; n_bands : number of bands, the last without an end
     """
     values = np.clip(values / step, 0.0, float(n_bands))
     of_corner = values[faces]
@@ -65,9 +65,9 @@ def cut(
 def _pieces(
     points: np.ndarray, values: np.ndarray, corner: np.ndarray, band: np.ndarray, n_bands: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the polygons, shape (n, 5, d), and which triangles of their fans are not empty.
+    """Return corners of the polygons, shape (n, 5, d), and which triangles of their fans exist.
 
-    corner : ndarray, shape (n, 3), of the triangle that each is a part of, ascending by value
+    corner : ndarray, shape (n, 3), corners of the parent triangle, ascending by value
     """
     v, x = values[corner], points[corner]
     begin = np.maximum(band, v[:, 0])

@@ -1,4 +1,4 @@
-"""The camera of each browser: standard views, the cube that says where it is, and a scale."""
+"""The camera of each browser: standard views, a cube that shows the direction, and a scale."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from avatar_ros.ui.view.orientation import (
 FIRST = "A"
 _LINE = (150, 150, 150)
 _NEAR = 0.001  # [m]
-_UNDER = 0.06  # from the scale to its number, in lengths of the scale
+_UNDER = 0.06  # distance from the scale to its number, in lengths of the scale
 
 
 class _Nodes(NamedTuple):
-    """What is drawn for one browser."""
+    """Nodes that are drawn for one browser."""
 
     line: Any
     length: Any
@@ -39,14 +39,14 @@ class _Nodes(NamedTuple):
 class Cameras:
     """Turns all cameras; each shows its own cube and scale.
 
-    on_cube : gets a browser and the drawing of its cube
+    on_cube : called with a browser and the drawing of its cube
     tips : of the tools [m], beside which numbers are; letters avoid them at the next turn
     """
 
     def __init__(self, server: viser.ViserServer, on_cube: Callable[[Any, str], None]) -> None:
         self._server, self._on_cube = server, on_cube
         self._centre, self._size = np.zeros(3), 0.2
-        self._vertices = np.zeros((1, 3))  # of the organ [m]
+        self._vertices = np.zeros((1, 3))  # vertices of the organ [m]
         self.tips = np.zeros((0, 3))
         self._nodes: dict[int, _Nodes] = {}
         self._lock = Lock()
@@ -54,7 +54,7 @@ class Cameras:
         server.on_client_disconnect(self._left)
 
     def show(self, vertices: np.ndarray) -> None:
-        """Letters around another organ, and the first view of it."""
+        """Place letters around another organ, and show its first view."""
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         self._centre, self._size = 0.5 * (low + high).astype(float), float((high - low).max())
         self._vertices = vertices
@@ -69,15 +69,15 @@ class Cameras:
                 self._moved(client, client.camera)
 
     def turn_to(self, side: str) -> None:
-        """A standard view of the organ, as "A", in every browser."""
+        """Show a standard view of the organ, as "A", in every browser."""
         self._turn(partial(standard_view, side, self._centre, self._size))
 
     def turn_beside(self, outward: np.ndarray) -> None:
-        """The view from the side of a surface's normal, in every browser."""
+        """Show the view from the side of a surface's normal, in every browser."""
         self._turn(partial(view_beside, outward, self._centre, self._size))
 
     def _turn(self, view: Callable[[float], Pose]) -> None:
-        """Turn the camera of every browser, to the view for the aspect of its picture."""
+        """Turn the camera of every browser, with the view for its picture's aspect."""
         for client in self._server.get_clients().values():
             turn_camera(client, view(client.camera.aspect))
 
@@ -110,7 +110,7 @@ class Cameras:
         nodes = self._nodes.get(client.client_id)
         if nodes is None:
             return
-        with self._lock:  # calls come in threads, and the last picture is to be of the last pose
+        with self._lock:  # calls come in threads, and the last picture must show the last pose
             self._draw(client, nodes, camera)
 
     def _draw(self, client: Any, nodes: _Nodes, camera: Any) -> None:
@@ -130,13 +130,13 @@ class Cameras:
 
 
 def _set(node: Any, name: str, value: Any) -> None:
-    """Change a property of a node, and send it only then."""
+    """Change a property of a node, and send it only if it differs."""
     if getattr(node, name) != value:
         setattr(node, name, value)
 
 
 def pose_of(camera: Any) -> Pose:
-    """Of a browser's camera."""
+    """Return the pose of a browser's camera."""
     return Pose(np.array(camera.position), np.array(camera.look_at), np.array(camera.up_direction))
 
 

@@ -1,7 +1,7 @@
-"""Colours of the organ: tissue at rest, and a scale distinguishable with colour vision deficiency.
+"""Colours of the organ: tissue at rest, and a scale readable with colour vision deficiency.
 
-The scale is in bands, whose edges are drawn where they are: between two there is no other colour.
-Below the first edge the organ is drawn as tissue.
+The scale consists of bands, so that its edges are exact lines without colours in between. Below the
+first edge the organ is drawn as tissue.
 """
 
 from __future__ import annotations
@@ -14,28 +14,28 @@ from avatar_ros.ui.view import tone
 
 MAP = "viridis"  # as in the pictures; perceptually uniform, readable in grey
 TOPS = (1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3)  # possible ends of the scale [m]
-N_BANDS = 20  # of the scale, the first of which is tissue
-N_SHADES = 20  # of tissue, from its dark to its light side
+N_BANDS = 20  # bands of the scale, the first of which is tissue
+N_SHADES = 20  # shades of tissue, from its dark to its light side
 TISSUE = (196, 112, 99)
-CLAMP = ((70, 70, 70), (165, 165, 165))  # checks where the organ is held
+CLAMP = ((70, 70, 70), (165, 165, 165))  # checks where the organ is clamped
 SPRINGS = (70, 70, 70)  # hatching where springs hold the organ
 ACCESS = (38, 84, 124)  # stripes where tools reach
 MISSED = (240, 228, 66)  # parts of an organ that a template does not reach
-HELD = (170, 170, 170)  # of a shape that is not that of now
-_DARKEST, _LIGHTEST = 0.42, 1.15  # over the colour of tissue
-_LIGHT = np.array([0.35, 0.75, 0.55])  # towards the lamp: from the front, above, a bit right
+HELD = (170, 170, 170)  # of a shape that is not the present one
+_DARKEST, _LIGHTEST = 0.42, 1.15  # factors of the colour of tissue
+_LIGHT = np.array([0.35, 0.75, 0.55])  # direction to the lamp: from the front, above, a bit right
 
 
 @cache
 def table() -> np.ndarray:
-    """The colour map, shape (256, 3), from zero to the end of the scale; 0 to 1."""
+    """Return the colour map, shape (256, 3), from zero to the end of the scale; 0 to 1."""
     from matplotlib import colormaps
 
     return np.asarray(colormaps[MAP](np.arange(256))[:, :3], np.float32)
 
 
 def colours(displacement: np.ndarray, top: float) -> np.ndarray:
-    """Colours by magnitude, shape (n, 3) float32, 0 to 1.
+    """Return colours by magnitude, shape (n, 3) float32, 0 to 1.
 
     Parameters
     ----------
@@ -47,14 +47,14 @@ def colours(displacement: np.ndarray, top: float) -> np.ndarray:
 
 
 def top_for(largest: float, before: float = TOPS[0]) -> float:
-    """The end of a scale that holds the largest displacement, and no less than before [m]."""
+    """Return a scale's end that covers the largest displacement, not smaller than before [m]."""
     wanted = max(largest, before)
     return next((top for top in TOPS if top >= wanted), TOPS[-1])
 
 
 @cache
 def band_colours() -> np.ndarray:
-    """What is seen of the bands, shape (N_BANDS, 3), 0 to 255; the first is that of tissue."""
+    """Return the seen colours of the bands, shape (N_BANDS, 3), 0 to 255; the first is tissue."""
     middle = (np.arange(N_BANDS) + 0.5) / N_BANDS
     wanted = 255.0 * table()[np.round(255 * middle).astype(int)]
     wanted[0] = TISSUE
@@ -63,7 +63,7 @@ def band_colours() -> np.ndarray:
 
 @cache
 def scale_colours() -> np.ndarray:
-    """The same, the first band too in the colour of the scale: tissue means something else."""
+    """Return the bands' colours with the scale's own first one, for fields where tissue differs."""
     wanted = 255.0 * table()[round(255 * 0.5 / N_BANDS)]
     first = np.round(tone.shown(tone.material(wanted))).astype(int)
     return np.vstack([first, band_colours()[1:]])
@@ -71,18 +71,18 @@ def scale_colours() -> np.ndarray:
 
 @cache
 def tissue_colours(colour: tuple[int, int, int] = TISSUE) -> np.ndarray:
-    """Tissue from its dark to its light side, shape (N_SHADES, 3), 0 to 255."""
+    """Return tissue from its dark to its light side, shape (N_SHADES, 3), 0 to 255."""
     return np.round(shaded(colour, (np.arange(N_SHADES) + 0.5) / N_SHADES)).astype(int)
 
 
 def shaded(colour: tuple[int, int, int], light: np.ndarray) -> np.ndarray:
-    """A colour under more or less light, of shape (n,), 0 to 1; shape (n, 3), 0 to 255."""
+    """Return a colour under light of shape (n,), 0 to 1; shape (n, 3), 0 to 255."""
     part = _DARKEST + (_LIGHTEST - _DARKEST) * np.asarray(light)[:, None]
     return np.asarray(np.clip(part * np.array(colour), 0.0, 255.0))
 
 
 def lightness(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """How light each vertex of a surface is, shape (n,), 0 to 1: half Lambert's."""
+    """Return how light each vertex of a surface is, shape (n,), 0 to 1, by half Lambert."""
     corners = vertices[faces].astype(float)
     own = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal = np.zeros((len(vertices), 3))

@@ -12,29 +12,29 @@ from avatar_ros.ui.view.organ import Organ
 from avatar_ros.ui.view.surface_view import Plane
 from avatar_ros.ui.view.tip_body import turn_to
 
-_BESIDE = 0.6  # of the organ's size, from its centre to the arrow
-_SIZE = 0.25  # of the arrow, over the organ's
-_MOVED = 1e-3  # part from which the handle is put elsewhere
+_BESIDE = 0.6  # distance from its centre to the arrow, relative to the organ's size
+_SIZE = 0.25  # size of the arrow relative to the organ's
+_MOVED = 1e-3  # change of the part from which the handle is put elsewhere
 
 
 def cut_heights(organ: Organ, normal: np.ndarray) -> tuple[float, float]:
-    """Where a plane of a normal cuts away nothing of an organ, and all of it [m]."""
+    """Return where a plane of a normal cuts away nothing of an organ, and all of it [m]."""
     heights = organ.vertices @ normal
     return float(heights.max()), float(heights.min())
 
 
 class CutHandle:
-    """One handle; ``on_cut`` gets the part of the organ's width that lies beyond the plane."""
+    """One handle; ``on_cut`` is called with the part of the organ's width beyond the plane."""
 
     def __init__(self, server: viser.ViserServer, on_cut: Callable[[float], None]) -> None:
         self._server, self._on_cut = server, on_cut
         self._handle: Any = None
         self._shown: tuple[str, tuple[float, ...]] | None = None  # organ and normal
-        self._heights = (0.0, 1.0)  # of the plane where nothing is cut away, and all [m]
+        self._heights = (0.0, 1.0)  # heights of the plane where nothing is cut away, and all [m]
         self._normal = np.zeros(3)
 
     def show(self, organ: Organ, normal: np.ndarray, part: float) -> Plane:
-        """Put the handle where a part is cut away from the side of a normal; the plane there."""
+        """Put the handle where a part is cut away from the side of a normal; return the plane."""
         self._heights, self._normal = cut_heights(organ, normal), normal
         first, last = self._heights
         height = first + part * (last - first)
@@ -61,7 +61,7 @@ class CutHandle:
         return Plane(height * normal, normal)
 
     def hide(self) -> None:
-        """No plane cuts."""
+        """Hide the handle: no plane cuts."""
         if self._handle is not None:
             self._handle.remove()
             self._handle = None

@@ -1,4 +1,4 @@
-"""What programs that show the organ need: the newest cloud on request, triangles as a message.
+"""Parts of programs that show the organ: the newest cloud on request, triangles as a message.
 
 There are no callbacks, so a cloud that is not shown costs no time: a viewer takes 30 of the 1,000
 that arrive each second.
@@ -29,7 +29,7 @@ from avatar_ros.framework.templates import (
     find_number,
 )
 
-RATE = 30.0  # of pictures [Hz]
+RATE = 30.0  # rate of pictures [Hz]
 
 
 class NewestCloud:
@@ -50,7 +50,7 @@ class NewestCloud:
         )
 
     def take(self) -> tuple[bytes, np.ndarray] | None:
-        """Stamp and points (n_points, 6) float32 [m] of a new cloud of this organ, or None."""
+        """Return stamp and points (n_points, 6) float32 [m] of this organ's new cloud, or None."""
         with self._subscription.handle:
             taken = self._subscription.handle.take_message(PointCloud2, True)
         if taken is None or not 0 <= len(taken[0]) - self._length < POINT_BYTES:
@@ -67,8 +67,12 @@ class NewestCloud:
 class TriangleTemplate(StampedTemplate):
     """A serialised Marker of triangles, of which only stamp, corners and colours are overwritten.
 
-    corners : view, shape (3 n_triangles, 3) float64 [m]
-    colours : view, shape (3 n_triangles, 4) float32, red, green, blue, opacity, 0 to 1
+    Attributes
+    ----------
+    corners : ndarray, shape (3 n_triangles, 3)
+        View, float64 [m].
+    colours : ndarray, shape (3 n_triangles, 4)
+        View, float32: red, green, blue, opacity, 0 to 1.
     """
 
     def __init__(self, frame_id: str, name: str, n_triangles: int) -> None:
@@ -97,7 +101,7 @@ class TriangleTemplate(StampedTemplate):
 
 
 def _find_colour(message: Marker, shade: ColorRGBA) -> int:
-    """Byte offset of one of the message's colours."""
+    """Return the offset of one of the message's colours [bytes]."""
     marks = (0.123456, 0.345678, 0.567891, 0.789123)
     shade.r, shade.g, shade.b, shade.a = marks
     start = find_bytes(struct.pack("=4f", *marks), serialize_message(message))
@@ -106,4 +110,4 @@ def _find_colour(message: Marker, shade: ColorRGBA) -> int:
 
 
 def _never_called(message: Any) -> None:
-    """Clouds are taken, not delivered."""
+    """Do nothing: clouds are taken, not delivered."""

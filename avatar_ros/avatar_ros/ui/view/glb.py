@@ -15,12 +15,12 @@ _ARRAY, _ELEMENTS = 34962, 34963
 
 
 def unlit_glb(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> bytes:
-    """A file of one mesh.
+    """Return a file of one mesh.
 
     Parameters
     ----------
     vertices : ndarray, shape (n, 3) [m]; faces : ndarray of int, shape (m, 3)
-    colours : ndarray, shape (n, 3), as they are to be seen, 0 to 255
+    colours : ndarray, shape (n, 3), colours as seen, 0 to 255
     """
     parts = [
         np.ascontiguousarray(vertices, "<f4"),

@@ -1,4 +1,4 @@
-"""The colour scale beside the picture, in the colours that the picture has."""
+"""The colour scale beside the picture, in the same colours."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _KEY = "display:inline-block;width:15px;height:11px;vertical-align:-1px;margin:0
 def legend(
     what: str, top: float, opacity: float = 1.0, has_springs: bool = False, has_access: bool = False
 ) -> str:
-    """The bands with the values at their edges, and what patterns mean, as HTML.
+    """Return the bands with the values at their edges, and the keys of patterns, as HTML.
 
     what : name of the scale with its unit; top : its end in that unit
-    has_springs, has_access : these are marked, too
-    opacity : of the organ, so that both look alike before the same ground; of glass, the legend
-        says that they do before no other
+    has_springs, has_access : whether these are marked
+    opacity : opacity of the organ, so that both look alike on the same background; with glass, the
+        legend says that they differ on other backgrounds
     """
-    is_everywhere = what != DISPLACEMENT  # where tools reach, from the first band on
+    is_everywhere = what != DISPLACEMENT  # tools' reach is marked from the first band on
     colours = scale_colours() if is_everywhere else band_colours()
     shades = [f"rgb({r},{g},{b})" for r, g, b in colours.tolist()]
     stops = ", ".join(
@@ -54,24 +54,24 @@ def legend(
 
 
 def key_of_clamp() -> str:
-    """The pattern of the clamp, and its name."""
+    """Return the pattern of the clamp, with its name."""
     dark, light = (f"rgb{colour}" for colour in CLAMP)
     checks = f"repeating-conic-gradient({dark} 0 25%, {light} 0 50%) 0 0/7px 7px"
     return f'<span style="{_KEY};background:{checks}"></span>clamp'
 
 
 def key_of_springs() -> str:
-    """The pattern of what springs hold, and its name."""
+    """Return the pattern of faces that springs hold, with its name."""
     lines = f"repeating-linear-gradient(45deg, rgb{SPRINGS} 0 2px, rgb{TISSUE} 2px 5px)"
     return f'<span style="{_KEY};background:{lines}"></span>springs'
 
 
 def key_of_access() -> str:
-    """The pattern of what tools reach, and its name."""
+    """Return the pattern of faces that tools reach, with its name."""
     stripes = f"repeating-linear-gradient(135deg, rgb{ACCESS} 0 2px, rgb{TISSUE} 2px 6px)"
     return f'<span style="{_KEY};background:{stripes}"></span>access'
 
 
 def key_of_missed() -> str:
-    """The colour of what a registered template does not reach, and its name."""
+    """Return the colour of parts that a registered template does not reach, with its name."""
     return f'<span style="{_KEY};background:rgb{MISSED}"></span>not reached'

@@ -15,21 +15,21 @@ _EDGE = 1e-9  # barycentric coordinates down to minus this count as inside
 class Place(NamedTuple):
     """A point of the tissue's surface, which moves with it.
 
-    corners : ndarray of int, shape (3,), points of the cloud; weights : of these
+    corners : ndarray of int, shape (3,), points of the cloud; weights : their weights
     """
 
     corners: np.ndarray
     weights: np.ndarray
 
     def at(self, points: np.ndarray) -> np.ndarray:
-        """The same sum of values at the cloud's points, as of their positions."""
+        """Return the weighted sum of values at the cloud's points, e.g. of their positions."""
         return np.asarray(self.weights @ np.asarray(points)[self.corners], float)
 
 
 def hit(
     origin: np.ndarray, direction: np.ndarray, points: np.ndarray, faces: np.ndarray
 ) -> Place | None:
-    """Where a ray first meets a surface (Moeller and Trumbore, Journal of Graphics Tools 2, 1997).
+    """Return where a ray first meets a surface (Moeller and Trumbore, J. Graphics Tools 2, 1997).
 
     origin, direction : ndarray, shape (3,); points : (n, 3) [m]; faces : (m, 3)
     """
@@ -51,13 +51,13 @@ def hit(
 
 
 def is_within(place: Place, direction: np.ndarray, points: np.ndarray) -> bool:
-    """Whether a ray comes from within a closed surface to where it first meets it."""
+    """Return whether a ray comes from within a closed surface to where it first meets it."""
     a, b, c = points[place.corners]
     return bool(np.cross(b - a, c - a) @ direction > 0.0)
 
 
 class Gap(NamedTuple):
-    """length [m]; begin, end : where it is shortest, each shape (3,) [m]."""
+    """Shortest gap: length [m]; begin, end : its ends, each shape (3,) [m]."""
 
     length: float
     begin: np.ndarray
@@ -65,7 +65,7 @@ class Gap(NamedTuple):
 
 
 def gap(body: np.ndarray, points: np.ndarray, faces: np.ndarray) -> Gap:
-    """The shortest way from points of a tool to a surface.
+    """Return the shortest gap from points of a tool to a surface.
 
     body : ndarray, shape (k, 3); points : (n, 3) [m]; faces : (m, 3)
     """
@@ -79,12 +79,13 @@ def gap(body: np.ndarray, points: np.ndarray, faces: np.ndarray) -> Gap:
 
 
 def depth(body: np.ndarray, points: np.ndarray, faces: np.ndarray) -> float:
-    """How deep the deepest point of a tool is below a closed surface [m]; negative: above it.
+    """Return the depth of a tool's deepest point below a closed surface [m]; negative: above it.
 
-    That of the surface as it is drawn and exported. The surface that a tool feels is smoother: on a
-    coarse mesh it lies some tenths of a millimetre beside it.
+    It refers to the surface as drawn and exported. The contact surface is smoother: on a coarse
+    mesh
+    it lies some tenths of a millimetre beside it.
 
-    Far from it, minus infinity: only faces around the tool are looked at.
+    Far from the surface it is minus infinity: only faces around the tool are used.
 
     body : ndarray, shape (k, 3); points : (n, 3) [m]; faces : (m, 3)
     """
@@ -104,7 +105,7 @@ def depth(body: np.ndarray, points: np.ndarray, faces: np.ndarray) -> float:
 
 
 def margin(plane: np.ndarray, points: np.ndarray) -> float:
-    """Distance of a plane from a structure [m]; negative: by how much it cuts into it.
+    """Return the distance of a plane from a structure [m]; negative: depth of its cut into it.
 
     plane : ndarray, shape (3, 3), three points; points : (n, 3), of the structure's surface
     """
@@ -115,13 +116,13 @@ def margin(plane: np.ndarray, points: np.ndarray) -> float:
 
 
 def normal_of(plane: np.ndarray) -> np.ndarray:
-    """The unit normal of the plane through three points (3, 3)."""
+    """Return the unit normal of the plane through three points (3, 3)."""
     normal = np.cross(plane[1] - plane[0], plane[2] - plane[0])
     return np.asarray(normal / max(float(np.linalg.norm(normal)), 1e-12))
 
 
 def is_plane(plane: np.ndarray) -> bool:
-    """Whether three points (3, 3) [m] are far enough from one line."""
+    """Return whether three points (3, 3) [m] are far enough from one line."""
     sides = plane[1] - plane[0], plane[2] - plane[0]
     area = float(np.linalg.norm(np.cross(*sides)))
     return area > 1e-2 * max(float(side @ side) for side in sides) > 0.0

@@ -1,4 +1,4 @@
-"""What the planning page shows of a vademecum."""
+"""The organ of a vademecum as the planning page shows it."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from avatar_ros.loop.settings import MATERIAL
 from avatar_ros.prepare.scenes import usable_material
 from avatar_ros.ui.view.measuring import hit, is_within
 
-CLEARANCE = 0.015  # of a new organ's tools over the surface [m]
-YOUNG_RANGE = (0.5e3, 1e6)  # that can be chosen [Pa]: the force is proportional to E
+CLEARANCE = 0.015  # height of a new organ's tools over the surface [m]
+YOUNG_RANGE = (0.5e3, 1e6)  # range of choices [Pa]: the force is proportional to E
 
 
 @dataclass(frozen=True, eq=False)
 class Organ:
     """An organ at rest.
 
-    vertices : ndarray, shape (n, 3) float32, of the cloud [m]; faces : (m, 3), of the organ
-    structures : faces of what lies inside, by name
+    vertices : ndarray, shape (n, 3) float32, points of the cloud [m]; faces : (m, 3), of the organ
+    structures : faces of the structures inside, by name
     clamped, sprung, accessible : ndarray of bool, shape (m,)
-    centre : of the bounding box [m]; size : its longest side [m]
+    centre : centre of the bounding box [m]; size : its longest side [m]
     start, normal : a point in the middle of the accessible surface [m], and the normal there
     ranges : lowest, highest and present value of each coordinate of the material, by name
     """
@@ -54,7 +54,7 @@ class Organ:
 
     @staticmethod
     def of(v: Vademecum) -> Organ:
-        """The organ of a vademecum."""
+        """Return the organ of a vademecum."""
         vertices = v.surface_vertices
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         j = middle_of_access(v)
@@ -86,13 +86,13 @@ class Organ:
         )
 
     def above(self, height: float) -> np.ndarray:
-        """A point over the middle of the accessible surface [m]."""
+        """Return a point over the middle of the accessible surface [m]."""
         return np.asarray(self.start + height * self.normal)
 
     def starts(self, tips: Sequence[Tip]) -> np.ndarray:
-        """Where tools begin, over the accessible surface, shape (n, 3) [m].
+        """Return where tools begin, over the accessible surface, shape (n, 3) [m].
 
-        The first is over its middle, and each other one as far from those before as can be.
+        The first is over its middle, and each other one as far from the earlier ones as possible.
         """
         surface, places = self.vademecum.surface, starts_apart(self.vademecum, len(tips))
         normals = surface.normals[places]
@@ -101,15 +101,15 @@ class Organ:
         return np.asarray(surface.centers[places] + heights[:, None] * normals)
 
     def outward(self, point: np.ndarray) -> np.ndarray:
-        """The outward normal of the accessible surface nearest to a point."""
+        """Return the outward normal of the accessible surface nearest to a point."""
         surface = self.vademecum.surface
         j = int(np.argmin(np.linalg.norm(surface.centers - point, axis=1)))
         return np.asarray(surface.normals[j] / np.linalg.norm(surface.normals[j]))
 
     def lifted(self, point: np.ndarray, clearance: float) -> np.ndarray:
-        """A point off the organ at rest, straight out from another, however deep that is.
+        """Return a point off the organ at rest, straight out from another, however deep that is.
 
-        clearance : from the other, or from where the way out leaves the organ [m]
+        clearance : distance from the other point, or from where the way out leaves the organ [m]
         """
         out = self.outward(point)
         met = hit(point, out, self.vertices, self.faces)
@@ -118,14 +118,14 @@ class Organ:
         return np.asarray(point + clearance * out)
 
     def usable(self, material: dict[str, float]) -> dict[str, float]:
-        """Values by coordinate that the contact node uses for this organ, of those it was given."""
+        """Return the given values by coordinate that the contact node uses for this organ."""
         return usable_material(self.vademecum, material)[0]
 
     def summary(self) -> str:
-        """Name, volume, material as built and certified error of the displacement, as HTML."""
+        """Return name, volume, material as built and certified displacement error, as HTML."""
         info = self.info
         errors = (
-            f"Certified error of the displacement: {info.l2_mean:.1%} in the mean, "
+            f"Certified error of the displacement: {info.l2_mean:.1%} on average, "
             f"{info.l2_worst:.1%} at worst."
         )
         return (
@@ -136,7 +136,7 @@ class Organ:
         )
 
     def _parts(self) -> str:
-        """Volumes of what a resection leaves, and its distance from structures at rest."""
+        """Return the volumes of a resection's parts, and its distance from structures at rest."""
         if self.vademecum.resection is None:
             return ""
         first, second = part_volumes(self.vademecum)

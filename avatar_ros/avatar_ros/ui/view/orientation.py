@@ -1,7 +1,7 @@
-"""Where the patient's right, left, front, back, head and feet are in the picture.
+"""Directions of the patient in the picture: right, left, front, back, head and feet.
 
 The organ's frame has the axes RAS: +x points to the patient's right, +y to the front (anterior),
-+z to the head (superior), whatever the axes of the file were that it came from.
++z to the head (superior), whatever the axes of the original file.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ NAMES = {
     "I": "inferior",
 }
 FOV = float(np.radians(35.0))  # vertical angle of the view
-_MARGIN = 1.25  # of a view around the organ
-_POLE = 0.02  # off the vertical, where a camera that turns about it has no up [rad]
-_LENGTHS = (1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3, 100e-3)  # of the scale bar [m]
-_BAR = 0.2  # of the picture's height, at most
+_MARGIN = 1.25  # relative margin of a view around the organ
+_POLE = 0.02  # angle off the vertical, where a camera that turns about it has no up [rad]
+_LENGTHS = (1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3, 100e-3)  # lengths of the scale bar [m]
+_BAR = 0.2  # longest bar, relative to the picture's height
 _SLANT = 0.5  # part of that view along the normal; the rest is from the side
 _ALONG = 0.85  # cosine to the line of sight from which a letter would lie on the organ
-_LETTER = 0.03  # of the picture's height, that a letter keeps from all else
-_NUMBERS = np.stack([np.linspace(-0.1, 0.1, 9), np.zeros(9)], axis=1)  # around a tip, over it
-_FARTHER = np.linspace(1.0, 2.0, 11)  # places of a letter that are tried, over the first one
+_LETTER = 0.03  # distance of a letter from all else, relative to the picture's height
+_NUMBERS = np.stack([np.linspace(-0.1, 0.1, 9), np.zeros(9)], axis=1)  # around and over a tip
+_FARTHER = np.linspace(1.0, 2.0, 11)  # tried places of a letter, relative to the first one
 _CUBE = 58  # width of the drawing [px]
 
 
 class Pose(NamedTuple):
-    """Of a camera: where it is and looks at [m], and what is up."""
+    """Pose of a camera: position and point looked at [m], and up direction."""
 
     position: np.ndarray
     look_at: np.ndarray
@@ -48,7 +48,7 @@ class Pose(NamedTuple):
 
 
 def standard_view(side: str, centre: np.ndarray, size: float, aspect: float = 1.0) -> Pose:
-    """From a side of the patient, as "A", at an organ of a longest side [m]: head or front up.
+    """Return the view from a side, as "A", at an organ of a longest side [m]: head or front up.
 
     aspect : width of the picture over its height; a narrow picture has the letters, too
     """
@@ -61,7 +61,7 @@ def standard_view(side: str, centre: np.ndarray, size: float, aspect: float = 1.
 
 
 def view_beside(outward: np.ndarray, centre: np.ndarray, size: float, aspect: float = 1.0) -> Pose:
-    """From the side of a surface's normal, so that a drag on the screen can press there."""
+    """Return the view from the side of a surface's normal, so that a drag can press there."""
     side = np.cross(AXES["S"], outward)
     side /= max(float(np.linalg.norm(side)), 1e-6)
     towards = _SLANT * outward + np.sqrt(1.0 - _SLANT**2) * side
@@ -71,7 +71,7 @@ def view_beside(outward: np.ndarray, centre: np.ndarray, size: float, aspect: fl
 
 
 def label_places(vertices: np.ndarray) -> dict[str, np.ndarray]:
-    """Where the letters stand around an organ [m]."""
+    """Return where the letters stand around an organ [m]."""
     low, high = vertices.min(axis=0).astype(float), vertices.max(axis=0).astype(float)
     centre, gap = 0.5 * (low + high), 0.06 * float((high - low).max())
     return {
@@ -83,10 +83,11 @@ def label_places(vertices: np.ndarray) -> dict[str, np.ndarray]:
 def seen_letters(
     vertices: np.ndarray, pose: Pose, fov: float, bar: np.ndarray, tips: np.ndarray, aspect: float
 ) -> dict[str, np.ndarray]:
-    """Where letters stand around an organ in a picture [m], over neither it nor one another.
+    """Return where letters stand around an organ in a picture [m], clear of it and of each other.
 
-    A letter moves out along its axis until it is free. One along the line of sight has no place,
-    nor has one that would be cut.
+    A letter moves out along its axis until it is free. A letter along the line of sight has no
+    place,
+    nor has one that would be cut off.
 
     vertices : of the organ, shape (n, 3) [m]; fov : vertical angle of the view
     bar : middle of the scale, shape (3,); tips : of tools, (n, 3) [m]; where numbers are
@@ -96,7 +97,7 @@ def seen_letters(
     distance = float(np.linalg.norm(pose.position - pose.look_at))
 
     def in_picture(points: np.ndarray) -> np.ndarray:
-        """Where points are, over the height of the picture."""
+        """Return where points are, relative to the height of the picture."""
         way = points - pose.look_at
         depth = np.maximum(distance - way @ towards, 0.1 * distance)
         return np.stack([way @ right, way @ up], axis=-1) / (
@@ -123,12 +124,12 @@ def seen_letters(
 
 
 def _middle(vertices: np.ndarray) -> np.ndarray:
-    """Middle of the bounding box, shape (3,) [m]."""
+    """Return the middle of the bounding box, shape (3,) [m]."""
     return np.asarray(0.5 * (vertices.min(axis=0) + vertices.max(axis=0)), float)
 
 
 def basis(pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """To the right in the picture, up, and towards the viewer."""
+    """Return the directions to the right in the picture, up, and towards the viewer."""
     towards = pose.position - pose.look_at
     towards = towards / np.linalg.norm(towards)
     right = np.cross(pose.up, towards)
@@ -137,7 +138,7 @@ def basis(pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def scale_bar(pose: Pose, fov: float, size: float) -> tuple[float, np.ndarray]:
-    """A round length [m] in the plane that is looked at, and its two ends, under the organ [m]."""
+    """Return a round length [m] in the plane looked at, and its two ends under the organ [m]."""
     right, up, _ = basis(pose)
     height = 2.0 * np.tan(0.5 * fov) * float(np.linalg.norm(pose.position - pose.look_at))
     length = max((x for x in _LENGTHS if x <= _BAR * height), default=_LENGTHS[0])
@@ -146,7 +147,7 @@ def scale_bar(pose: Pose, fov: float, size: float) -> tuple[float, np.ndarray]:
 
 
 def cube(pose: Pose) -> str:
-    """The patient's sides on a cube as the camera sees it, as SVG."""
+    """Return the patient's sides on a cube as the camera sees it, as SVG."""
     right, up, towards = basis(pose)
     axes = np.stack([right, up, towards])
     seen = sorted(AXES, key=lambda letter: float(axes[2] @ AXES[letter]))
@@ -159,7 +160,7 @@ def cube(pose: Pose) -> str:
 
 
 def _side(letter: str, axes: np.ndarray) -> str:
-    """A face of the cube with its letter, drawn as it lies."""
+    """Return a face of the cube with its letter, drawn as it lies."""
     normal = np.array(AXES[letter])
     along = np.array(AXES["S"] if letter not in "SI" else AXES["A"])
     across = np.cross(along, normal)

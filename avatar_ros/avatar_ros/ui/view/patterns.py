@@ -1,4 +1,4 @@
-"""Patterns on a surface, that tell regions apart without any colour: checks, stripes, hatching.
+"""Patterns on a surface that tell regions apart without colour: checks, stripes, hatching.
 
 They are cut into the triangles by planes in space, so that they do not swim when the view turns.
 """
@@ -12,20 +12,20 @@ import numpy as np
 from avatar_ros.ui.view.bands import Banded, cut
 
 CHECK = 5e-3  # side of a check [m]
-STRIPE, GAP = 1.5e-3, 4  # width of a stripe [m], and from one to the next, in widths
-# Two directions of checks, no face of an organ being square to both, and one of stripes [-].
+STRIPE, GAP = 1.5e-3, 4  # width of a stripe [m], and gap to the next, in widths
+# two directions of checks, no face of an organ being square to both, and one of stripes [-]
 _CHECKS = np.array([[0.80, 0.36, 0.48], [-0.48, 0.80, 0.36]])
 _STRIPES = np.array([0.70, 0.14, 0.70])
-HATCH, HATCH_GAP = 2e-3, 3  # width of a line [m], and from one to the next, in widths
+HATCH, HATCH_GAP = 2e-3, 3  # width of a line [m], and gap to the next, in widths
 _HATCHES = np.array([-0.64, 0.48, 0.60])  # across the stripes
 
 
 class Patterned(NamedTuple):
-    """Triangles, none of which a border of the pattern crosses.
+    """Triangles that no border of the pattern crosses.
 
     points : ndarray, shape (n', d), the given ones first
     faces : ndarray of int, shape (m', 3); parent : (m',), the given face that each is a part of
-    is_marked : (m',) bool, the one of the two parts of the pattern
+    is_marked : (m',) bool, whether it belongs to the marked part of the pattern
     """
 
     points: np.ndarray
@@ -35,7 +35,7 @@ class Patterned(NamedTuple):
 
 
 def checkered(points: np.ndarray, faces: np.ndarray) -> Patterned:
-    """Checks on some faces (m, 3) of points (n, d), whose first three numbers are places [m]."""
+    """Draw checks on faces (m, 3) of points (n, d), whose first three numbers are places [m]."""
     first = _sliced(points, faces, _CHECKS[0], CHECK)
     second = _sliced(first.points, first.faces, _CHECKS[1], CHECK)
     other = first.band[second.parent]
@@ -45,12 +45,12 @@ def checkered(points: np.ndarray, faces: np.ndarray) -> Patterned:
 
 
 def striped(points: np.ndarray, faces: np.ndarray) -> Patterned:
-    """Thin stripes on some faces, as :func:`checkered`."""
+    """Draw thin stripes on some faces, as :func:`checkered`."""
     return _lined(points, faces, _STRIPES, STRIPE, GAP)
 
 
 def hatched(points: np.ndarray, faces: np.ndarray) -> Patterned:
-    """Broad lines across the stripes on some faces, as :func:`checkered`."""
+    """Draw broad lines across the stripes on some faces, as :func:`checkered`."""
     return _lined(points, faces, _HATCHES, HATCH, HATCH_GAP)
 
 

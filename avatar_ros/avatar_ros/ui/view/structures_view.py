@@ -1,4 +1,4 @@
-"""What lies inside the organ on the planning page, as tumours: shaded, moved with the organ."""
+"""Structures inside the organ on the planning page, e.g. tumours: shaded, moved with the organ."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class StructuresView:
         self._parts: list[_Part] = []
 
     def show(self, vertices: np.ndarray, structures: dict[str, np.ndarray]) -> None:
-        """Show those of another organ, at rest; none of the last one stays."""
+        """Show the structures of another organ, at rest, in place of the last ones."""
         for part in self._parts:
             part.mesh.remove()
         self._parts = [
@@ -74,12 +74,12 @@ class StructuresView:
         return parts
 
     def move(self, points: np.ndarray) -> None:
-        """Move them as in a cloud, (n, 3) [m]."""
+        """Move the structures as in a cloud, (n, 3) [m]."""
         for part in self._parts:
             part.mesh.vertices = np.ascontiguousarray(points[part.used], np.float32)
 
 
 def _shades_of(colour: tuple[int, int, int]) -> list[list[int]]:
-    """What is sent for the shades of a colour, from dark to light."""
+    """Return the sent colours for the shades of a colour, from dark to light."""
     seen = shaded(colour, (np.arange(_N_SHADES) + 0.5) / _N_SHADES)
     return [[int(x) for x in row] for row in tone.material(seen)]

@@ -2,7 +2,7 @@
 
 viser gives each mesh a single colour, so that each band is a mesh, and so is each shade of tissue.
 Tissue lies where the field stays below the first edge of the scale. Its triangles are cut once, at
-rest; from then on only those are chosen that the bands leave, and moved where they moved visibly.
+rest. Later only triangles outside the bands are chosen, and moved where they moved visibly.
 """
 
 from __future__ import annotations
@@ -29,33 +29,33 @@ from avatar_ros.ui.view.colours import (
 )
 from avatar_ros.ui.view.patterns import Patterned, checkered, hatched, striped
 
-GLASS = 0.45  # opacity of an organ that is seen through
-OUTLINE = (30, 16, 14)  # of a section
-INSIDE = (120, 52, 45)  # of the far wall of an organ that is cut open
-N_TONES = N_SHADES + 4  # of tissue: its shades, and the colours of patterns
+GLASS = 0.45  # opacity of a transparent organ
+OUTLINE = (30, 16, 14)  # outline of a section
+INSIDE = (120, 52, 45)  # far wall of an organ that is cut open
+N_TONES = N_SHADES + 4  # shades of tissue, and the colours of patterns
 _HELD_DARK, _HELD_LIGHT, _SPRUNG, _REACHED = range(N_SHADES, N_TONES)
-_PATTERNS = ((checkered, _HELD_DARK), (hatched, _SPRUNG), (striped, _REACHED))  # of Marks
-_MOVED = 0.1e-3  # of tissue, that is seen [m]
-_NO_FACE = np.zeros((1, 3), np.uint32)  # of a mesh without faces, which must not be empty
+_PATTERNS = ((checkered, _HELD_DARK), (hatched, _SPRUNG), (striped, _REACHED))  # patterns of Marks
+_MOVED = 0.1e-3  # smallest visible motion of tissue [m]
+_NO_FACE = np.zeros((1, 3), np.uint32)  # face of an unused mesh, which must not be empty
 _NO_LINE = np.zeros((1, 2, 3), np.float32)
 _NO_POINT = np.zeros((1, 3), np.float32)
 
 
 class Plane(NamedTuple):
-    """What lies on the side of its normal, at rest, is not shown; point [m]."""
+    """A plane; all on the side of its normal, at rest, is hidden; point [m]."""
 
     point: np.ndarray
     normal: np.ndarray
 
     def above(self, points: np.ndarray) -> np.ndarray:
-        """Height over the plane [m]."""
+        """Return the height over the plane [m]."""
         return np.asarray((points - self.point) @ self.normal)
 
 
 class Marks(NamedTuple):
     """Faces of regions that have a pattern, ndarrays of bool, shape (m,).
 
-    sprung : that springs hold
+    sprung : faces that springs hold
     """
 
     clamped: np.ndarray
@@ -66,8 +66,8 @@ class Marks(NamedTuple):
 class Tissue(NamedTuple):
     """Triangles of tissue at rest, by shade; those of patterns have further numbers.
 
-    corners : ndarray of int, shape (n, 3), points of the cloud that each point hangs on
-    weights : ndarray, shape (n, 3), of these
+    corners : ndarray of int, shape (n, 3), points of the cloud that move each point
+    weights : ndarray, shape (n, 3), their weights
     faces : ndarray of int, shape (m, 3); shade : (m,); parent : (m,), face of the organ
     """
 
@@ -78,14 +78,14 @@ class Tissue(NamedTuple):
     parent: np.ndarray
 
     def moved(self, points: np.ndarray) -> np.ndarray:
-        """Its points where those of the cloud are [m]."""
+        """Return the positions of its points for those of the cloud [m]."""
         return np.einsum("ni,nid->nd", self.weights, points[self.corners])
 
 
 def tissue_of(
     vertices: np.ndarray, faces: np.ndarray, light: np.ndarray, plane: Plane | None, marks: Marks
 ) -> Tissue:
-    """The organ's surface at rest, cut by shade and patterns, without what lies beyond a plane."""
+    """Cut the organ's surface at rest by shade and patterns, without the part beyond a plane."""
     data = np.column_stack([vertices, light])
     kept, parents = faces, np.arange(len(faces))
     if plane is not None:
@@ -116,7 +116,7 @@ def tissue_of(
 def _below(
     data: np.ndarray, height: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, faces, and the given face of each, of what is below a height of 0."""
+    """Return points, faces, and the given face of each, below a height of 0."""
     far = 1.0 + float(np.abs(height).max())
     halves = cut(data, height + far, faces, far, 2)
     kept = halves.band == 0
@@ -124,7 +124,7 @@ def _below(
 
 
 def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Weights (n, 3) of the corners (n, 3, 3) of triangles that points (n, 3) lie in."""
+    """Return weights (n, 3) of the corners (n, 3, 3) of triangles that points (n, 3) lie in."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = points - corners[:, 0]
     aa, ab, bb = ((x * y).sum(axis=1) for x, y in ((a, a), (a, b), (b, b)))
@@ -135,7 +135,7 @@ def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def section(points: np.ndarray, height: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Lines on which a surface has a height of zero, shape (k, 2, 3) float32 [m].
+    """Return lines on which a surface has a height of zero, shape (k, 2, 3) float32 [m].
 
     points : ndarray, shape (n, 3) [m]; height : (n,), linear on each of the faces (m, 3)
     """
@@ -153,7 +153,7 @@ class SurfaceView:
     """Draws the surface into a viser server.
 
     root : name of the node above all of its meshes
-    is_reach_marked : a pattern is drawn where tools reach
+    is_reach_marked : whether a pattern is drawn where tools reach
     """
 
     def __init__(self, server: viser.ViserServer, root: str) -> None:
@@ -173,7 +173,7 @@ class SurfaceView:
 
     @property
     def opacity(self) -> float:
-        """Of the organ."""
+        """Return the opacity of the organ."""
         return 1.0 if self._opacity is None else self._opacity
 
     def show(self, vertices: np.ndarray, faces: np.ndarray, marks: Marks) -> None:
@@ -185,7 +185,7 @@ class SurfaceView:
         self._make()
 
     def mark_reach(self, wanted: bool) -> None:
-        """Draw a pattern where tools reach, or none."""
+        """Draw or hide the pattern where tools reach."""
         if wanted != self.is_reach_marked:
             self.is_reach_marked = wanted
             if len(self._faces):
@@ -193,17 +193,17 @@ class SurfaceView:
 
     @property
     def plane(self) -> Plane | None:
-        """Where the organ is cut open."""
+        """Return the plane that cuts the organ open, if any."""
         return self._plane
 
     def look_inside(self, glass: bool, plane: Plane | None) -> None:
-        """See through the organ, or cut it open; the next cloud is drawn so."""
+        """Make the organ transparent, or cut it open, from the next cloud on."""
         self._opacity, self._plane = (GLASS if glass else None), plane
         if len(self._faces):
             self._make()
 
     def _make(self) -> None:
-        """All meshes, with the tissue at rest; those of bands still empty."""
+        """Make all meshes, with the tissue at rest and empty bands."""
         self._tissue = tissue_of(
             self._vertices,
             self._faces,
@@ -255,7 +255,7 @@ class SurfaceView:
             self._of_shade.append((moved[used], local, tissue.parent[chosen]))
 
     def _choose_tissue(self, is_band: np.ndarray) -> None:
-        """Draw the triangles of tissue in faces of the organ that no band takes."""
+        """Draw the triangles of tissue in faces of the organ without a band."""
         for k, (points, local, parent) in enumerate(self._of_shade):
             left = ~is_band[parent]
             key = np.packbits(left).tobytes()
@@ -266,12 +266,12 @@ class SurfaceView:
             draw(self._nodes["tissue", k], points, chosen if len(chosen) else _NO_FACE)
 
     def _draw_inside(self, points: np.ndarray) -> None:
-        """The far wall: seen where the organ is cut open, and behind every crack between meshes.
+        """Draw the far wall: seen in a cut organ, and behind every crack between meshes.
 
         Meshes of different cuts meet in points that lie beside each other's edges by rounding; a
-        browser leaves single pixels open there, which would show the ground.
+        browser leaves single pixels open there, which would show the background.
         """
-        if self._opacity is not None:  # of glass, it would be seen
+        if self._opacity is not None:  # it would be seen through glass
             return
         if self._plane is None:
             draw(self._nodes["inside", 0], points, self._faces.astype(np.uint32))
@@ -294,7 +294,7 @@ class SurfaceView:
     def paint(self, points: np.ndarray, values: np.ndarray, top: float) -> None:
         """Draw another field, given at the cloud's points.
 
-        values : ndarray, shape (n,); a face at whose corners one is NaN stays tissue
+        values : ndarray, shape (n,); a face with NaN at a corner stays tissue
         """
         is_known = np.isfinite(values)
         self._known = is_known[self._faces].all(axis=1)
@@ -346,7 +346,7 @@ class SurfaceView:
         draw(mesh, points[used], local)  # the points of all would be sent many times
 
     def grey(self, held: bool) -> None:
-        """Draw all in grey while the shape is not that of now, or in colours again."""
+        """Draw all in grey while the shape is not the present one, or in colours again."""
         if held == self.is_grey or not self._nodes:
             return
         self.is_grey = held
@@ -356,7 +356,7 @@ class SurfaceView:
                     self._nodes[group, k].color = tuple(colour)
 
     def _colours(self) -> dict[str, np.ndarray]:
-        """What is seen of each group of meshes; patterns keep their colours in grey."""
+        """Return the seen colours of each group of meshes; patterns keep their colours in grey."""
         shades, bands = tissue_colours(), scale_colours()
         if self.is_grey:
             shades, bands = tissue_colours(HELD), np.tile(HELD, (N_BANDS, 1))
@@ -365,7 +365,7 @@ class SurfaceView:
 
 
 def draw(mesh: Any, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Change a mesh in an order in which no face ever names a vertex that is not there."""
+    """Change a mesh in an order in which no face ever names a missing vertex."""
     vertices = np.ascontiguousarray(vertices, np.float32)
     if len(vertices) >= len(mesh.vertices):
         mesh.vertices, mesh.faces = vertices, faces
@@ -374,7 +374,7 @@ def draw(mesh: Any, vertices: np.ndarray, faces: np.ndarray) -> None:
 
 
 def own(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The points that some faces use, and the faces over these alone."""
+    """Return the points that some faces use, and the faces over these alone."""
     is_used = np.zeros(int(faces.max()) + 1, bool)
     is_used[faces] = True
     place = np.cumsum(is_used, dtype=np.uint32) - np.uint32(1)

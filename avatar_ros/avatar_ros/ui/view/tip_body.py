@@ -13,7 +13,7 @@ _LENGTH, _WIDTH = 0.09, 0.5  # of the whole shaft: length [m], radius in radii o
 
 
 def tip_body(tip: Tip) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) [m] and faces (m, 3) of a tip and a piece of its shaft.
+    """Return vertices (n, 3) [m] and faces (m, 3) of a tip and a piece of its shaft.
 
     The pose of the tip is at the origin, its shaft along z.
     """
@@ -27,13 +27,13 @@ def tip_body(tip: Tip) -> tuple[np.ndarray, np.ndarray]:
 
 
 def shaft_body(tip: Tip) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) [m] and faces (m, 3) of the shaft, which is not felt, along z."""
+    """Return vertices (n, 3) [m] and faces (m, 3) of the shaft, without contact, along z."""
     r = _WIDTH * tip.radius * np.array([0.0, 1.0, 1.0, 0.0])
     return _revolved(r, np.array([0.0, 0.0, _LENGTH, _LENGTH]))
 
 
 def _revolved(r: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The surface that a line of points (r, z) draws around z."""
+    """Return the surface that a line of points (r, z) draws around z."""
     angle = np.linspace(0.0, 2.0 * np.pi, _N_SIDES, endpoint=False)
     vertices = np.stack(
         np.broadcast_arrays(r[:, None] * np.cos(angle), r[:, None] * np.sin(angle), z[:, None]),
@@ -47,7 +47,7 @@ def _revolved(r: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def turn_to(direction: np.ndarray) -> np.ndarray:
-    """The quaternion w x y z that turns z to a unit vector by the shortest way."""
+    """Return the quaternion w x y z that turns z to a unit vector by the shortest way."""
     x, y, z = direction
     quaternion = np.array([1.0 + z, -y, x, 0.0])
     size = float(np.linalg.norm(quaternion))
@@ -55,12 +55,12 @@ def turn_to(direction: np.ndarray) -> np.ndarray:
 
 
 def turned(points: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    """Points turned by a quaternion w x y z."""
+    """Return points turned by a quaternion w x y z."""
     w, v = quaternion[0], quaternion[1:]
     return points + 2.0 * np.cross(v, np.cross(v, points) + w * points)
 
 
 def along_shaft(quaternion: np.ndarray) -> np.ndarray:
-    """Where z points that a quaternion w x y z has turned."""
+    """Return the direction of z after a quaternion w x y z has turned it."""
     w, x, y, z = quaternion
     return 2.0 * np.array([x * z + w * y, y * z - w * x, 0.5 - x * x - y * y])

@@ -17,22 +17,22 @@ from avatar_ros.ui.view.tip_body import along_shaft, shaft_body, tip_body, turne
 
 TOOL, SHAFT = (0, 114, 178), (150, 160, 170)
 ARROW = (213, 94, 0)
-HELD = (0, 0, 0)  # of the mark where a jaw holds tissue
-LEAST_FORCE = 1e-3  # that is shown [N]
-_UNSEEN = 1e-5  # change of positions [m], turns and forces [N] that nobody sees
+HELD = (0, 0, 0)  # colour of the mark where a jaw holds tissue
+LEAST_FORCE = 1e-3  # smallest force that is shown [N]
+_UNSEEN = 1e-5  # smallest visible change of positions [m], turns and forces [N]
 _SCALE = 0.004  # length of the arrow per force [m/N]
-_BESIDE = 0.01  # from a tip that feels nothing to its name [m]
-# Of labels around a tip, each has a quarter: beside two names, the largest displacement and a gap.
+_BESIDE = 0.01  # distance from a tip without force to its name [m]
+# labels around a tip have a quarter each: names, the largest displacement and a gap
 _ANCHORS: tuple[Any, Any] = ("bottom-right", "bottom-left")
-_LENGTHS = (0.012, 0.06)  # of the arrow, at least and at most [m]
+_LENGTHS = (0.012, 0.06)  # shortest and longest arrow [m]
 
 
 class ToolView:
     """Draws a tool.
 
-    number : among the tools, from 0
-    on_drag : gets the tool's number, where its tip was when the mouse took it [m], how far the
-        mouse moved since [m], and whether along the shaft alone
+    number : index of the tool, from 0
+    on_drag : called with the tool's number, position of its tip when the mouse took it [m], way of
+        the mouse since [m], and whether along the shaft alone
     """
 
     def __init__(
@@ -47,15 +47,16 @@ class ToolView:
         self._tool: Any = None
         self._arrow: Any = None
         self._mark: Any = None
-        self._below = 0.0  # of the jaw from the tip's pose [m]
+        self._below = 0.0  # distance of the jaw from the tip's pose [m]
         self._text: Any = None
         self._label = ""
-        self._placed: np.ndarray | None = None  # tip, turn and force that are seen
+        self._placed: np.ndarray | None = None  # tip, turn and force in the picture
         self._taken = np.zeros((2, 3))  # tip and mouse when a drag began [m]
-        self._bodies: tuple[tuple[np.ndarray, np.ndarray], ...] = ()  # of tip and shaft, upright
+        # bodies of tip and shaft, upright
+        self._bodies: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
 
     def remove(self) -> None:
-        """Draw the tool no more."""
+        """Remove the tool from the picture."""
         self._node.remove()
 
     def show(self, tip: Tip, position: np.ndarray, wxyz: np.ndarray) -> None:
@@ -99,11 +100,11 @@ class ToolView:
 
     @property
     def position(self) -> np.ndarray:
-        """Of the tip [m]."""
+        """Return the position of the tip [m]."""
         return np.array(self._tool.position)
 
     def distance(self, origin: np.ndarray, direction: np.ndarray) -> float:
-        """From the origin of a ray to where it meets the tool [m]; infinite beside it."""
+        """Return the distance from a ray's origin to the tool [m]; infinite if it misses."""
         found = [np.inf]
         for upright, faces in self._bodies:
             points = self.position + turned(upright, np.array(self._tool.wxyz))
@@ -113,7 +114,7 @@ class ToolView:
         return min(found)
 
     def _dragged(self, event: Any, along_shaft: bool) -> None:
-        # Counted from the drag's begin: a slow browser says of a tool where it drew it long ago.
+        # counted from the drag's begin: a slow browser reports where it drew the tool long ago
         mouse = np.array(event.end_position)
         if event.phase == "start":
             self._taken = np.stack([self.position, mouse])
@@ -123,9 +124,9 @@ class ToolView:
     def place(
         self, tip: np.ndarray, wxyz: np.ndarray, force: np.ndarray, holds: bool = False
     ) -> None:
-        """Show the tool at its tip [m], with the force on it [N], and what its jaw holds.
+        """Show the tool at its tip [m], with the force on it [N], and whether its jaw holds tissue.
 
-        Nothing is sent where nothing changes: a browser draws only then.
+        Nothing is sent if nothing changes: a browser draws only then.
         """
         now = np.concatenate([tip, wxyz, force, [holds]])
         if self._placed is not None and np.abs(now - self._placed).max() < _UNSEEN:
@@ -151,7 +152,7 @@ class ToolView:
 
 
 def _set(node: Any, name: str, value: Any) -> None:
-    """Change a property of a node, and send it only then."""
+    """Change a property of a node, and send it only if it differs."""
     if getattr(node, name) != value:
         setattr(node, name, value)
 

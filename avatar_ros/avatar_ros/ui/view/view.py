@@ -1,4 +1,4 @@
-"""The three-dimensional part of the planning page: organ, what is in it, tools and forces."""
+"""The three-dimensional part of the planning page: organ, structures in it, tools and forces."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from avatar_ros.ui.view.tip_body import turn_to
 from avatar_ros.ui.view.tool_view import ToolView
 
 FIELD_TOPS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # possible ends of the scale of another field
-LOOKS = WHOLE, GLASS, CUT, HIDDEN = "whole", "glass", "cut open", "hidden"  # how it is shown
-_SURFACE = "/organ/surface"  # node above what is hidden with the organ alone
-_ROOTS = ("/organ", "/structures", "/tools", "/measures")  # nodes above what is of an organ
-_AT_REST = 0.02e-3  # displacement of an organ that nothing touches; its scale begins anew [m]
+LOOKS = WHOLE, GLASS, CUT, HIDDEN = "whole", "glass", "cut open", "hidden"  # looks of the organ
+_SURFACE = "/organ/surface"  # node above all that is hidden with the organ
+_ROOTS = ("/organ", "/structures", "/tools", "/measures")  # nodes above all parts of an organ
+_AT_REST = 0.02e-3  # displacement of an untouched organ; its scale begins anew [m]
 _NO_TIPS = np.zeros((0, 3))
-_LEAST_MARKED = 0.1e-3  # displacement whose place is marked [m]
+_LEAST_MARKED = 0.1e-3  # smallest displacement whose place is marked [m]
 
 
 class OrganView:
     """Draws into a viser server; everything in metres, in the organ's frame.
 
-    on_drag : gets which tool a user drags, from where, how far, and whether along its shaft
-    on_cube : gets a browser and its cube; on_cut : the part that a user cuts away by the handle
+    on_drag : called with the dragged tool, from where, how far, and whether along its shaft
+    on_cube : called with a browser and its cube; on_cut : with the part cut away by the handle
     top, field_top : ends of the colour scales, of the displacement [m] and of another field
     """
 
@@ -54,9 +54,10 @@ class OrganView:
         self._tools: list[ToolView] = []
         self._beside = 0  # the tool to which a view can be turned
         self._cameras = Cameras(server, on_cube)
-        self._drawn: np.ndarray | None = None  # the cloud that is seen
+        self._drawn: np.ndarray | None = None  # the cloud in the picture
         self._largest = 0.0
-        self._field: np.ndarray | None = None  # other than the displacement, at the cloud's points
+        # values other than the displacement, at the cloud's points
+        self._field: np.ndarray | None = None
         self.field_top = FIELD_TOPS[0]
         self.top = top_for(0.0)
         server.scene.set_up_direction("+z")
@@ -66,8 +67,7 @@ class OrganView:
         server.scene.add_light_ambient("/light", intensity=tone.AMBIENT)
 
     def show(self, organ: Organ, tips: tuple[Tip, ...]) -> None:
-        """Show another organ, at rest, with the structures of its own file and no others, and with
-        a tool over it for each tip."""
+        """Show another organ, at rest, with its own file's structures and a tool for each tip."""
         scene = self._server.scene
         for tool in self._tools:
             tool.remove()
@@ -91,14 +91,14 @@ class OrganView:
 
     @property
     def points(self) -> np.ndarray:
-        """Of the cloud that is drawn, or of the organ at rest, shape (n, 3) [m]."""
+        """Return the points of the drawn cloud, or of the organ at rest, shape (n, 3) [m]."""
         if self._drawn is None:
             return np.zeros((0, 3)) if self._organ is None else self._organ.vertices
         return self._drawn[:, :3]
 
     @property
     def faces(self) -> np.ndarray:
-        """Of the organ as it is drawn, without what is cut away or hidden, shape (n, 3)."""
+        """Return the drawn faces of the organ, without cut or hidden ones, shape (n, 3)."""
         organ, plane = self._organ, self._surface.plane
         if organ is None or not self._skin.visible:
             return np.zeros((0, 3), int)
@@ -107,7 +107,7 @@ class OrganView:
         return np.asarray(organ.faces[plane.above(organ.vertices[organ.faces].mean(axis=1)) <= 0])
 
     def clicked(self, origin: np.ndarray, direction: np.ndarray) -> Place | None:
-        """Where a ray first meets the organ as it is drawn; None beside it, and behind a tool."""
+        """Return where a ray first meets the drawn organ; None beside it, and behind a tool."""
         place, points = hit(origin, direction, self.points, self.faces), self.points
         if place is None:
             return None
@@ -117,7 +117,7 @@ class OrganView:
 
     @property
     def opacity(self) -> float:
-        """Of the organ."""
+        """Return the opacity of the organ."""
         return self._surface.opacity
 
     def look(self, how: str, side: str = "A", part: float = 0.5) -> None:
@@ -152,11 +152,11 @@ class OrganView:
 
     @property
     def is_reach_marked(self) -> bool:
-        """Whether a pattern is drawn where tools reach."""
+        """Return whether a pattern is drawn where tools reach."""
         return self._surface.is_reach_marked
 
     def mark_reach(self, wanted: bool) -> None:
-        """Draw a pattern where tools reach, or none."""
+        """Draw or hide the pattern where tools reach."""
         self._surface.mark_reach(wanted)
         if self._drawn is not None:
             self._surface.redraw()
@@ -166,24 +166,24 @@ class OrganView:
         self._structures.style(name, is_seen, colour, opacity)
 
     def set_aside(self, aside: bool) -> None:
-        """Hide all of the organ in use while something else is shown, or show it again."""
+        """Hide the organ in use while something else is shown, or show it again."""
         for root in self._roots.values():
             root.visible = not aside
 
     def turn_to(self, side: str) -> None:
-        """A standard view, as "A", or that beside the tool, in every browser."""
+        """Show a standard view, as "A", or that beside the tool, in every browser."""
         if side in AXES:
             self._cameras.turn_to(side)
         elif self._organ is not None and self._tools:
             self._cameras.turn_beside(self._organ.outward(self._tools[self._beside].position))
 
     def _upright(self, position: np.ndarray) -> np.ndarray:
-        """Turns the shaft along the surface's normal, for which the force is computed."""
+        """Turn the shaft along the surface's normal, for which the force is computed."""
         assert self._organ is not None
         return turn_to(self._organ.outward(position))
 
     def show_tools(self, tips: tuple[Tip, ...], places: np.ndarray) -> None:
-        """Show tools, in place of those before, with their tips at places (n, 3) [m]."""
+        """Show tools, in place of earlier ones, with their tips at places (n, 3) [m]."""
         self._beside = 0
         if self._organ is None:
             return
@@ -200,13 +200,13 @@ class OrganView:
         self.show_tools(tips, np.array([tool.position for tool in self._tools]))
 
     def name_tools(self, labels: Sequence[str], chosen: int) -> None:
-        """Write the names of the tools beside them, and turn to the chosen one if asked to."""
+        """Write the names of the tools beside them, and turn to the chosen one on request."""
         self._beside = chosen
         for k, (tool, label) in enumerate(zip(self._tools, labels, strict=False)):
             tool.name(label, k == chosen)
 
     def move(self, points: np.ndarray) -> float:
-        """Move the surface as in a cloud, (n, 6) [m]; returns the largest displacement [m].
+        """Move the surface as in a cloud, (n, 6) [m]; return the largest displacement [m].
 
         The same cloud is not drawn twice.
         """
@@ -232,7 +232,7 @@ class OrganView:
         return self._largest
 
     def _mark(self, place: np.ndarray) -> None:
-        """The place of the largest displacement."""
+        """Mark the place of the largest displacement."""
         if self._largest > _LEAST_MARKED:
             self._marker.position = tuple(place)
             text = f"max {1e3 * self._largest:.1f} mm"
@@ -246,14 +246,13 @@ class OrganView:
             self._marker.visible = is_seen
 
     def grey(self, held: bool) -> None:
-        """Draw the organ in grey, and without a number, while its shape is not that of now."""
+        """Draw the organ in grey, and without a number, while its shape is not the present one."""
         self._surface.grey(held)
         if self._organ is not None:
             self._show_mark()
 
     def place_tools(self, tips: np.ndarray, forces: np.ndarray, holds: Sequence[bool]) -> None:
-        """Show the tools at their tips, (n, 3) [m], with the forces on them [N], and which of them
-        hold tissue."""
+        """Show the tools at their tips, (n, 3) [m], with their forces [N] and closed jaws."""
         self._cameras.tips = tips
         with self._server.atomic():
             for tool, tip, force, holds_it in zip(self._tools, tips, forces, holds, strict=False):
