@@ -1,4 +1,4 @@
-"""Benchmark of a whole cell of real processes over real DDS: does this machine keep 1 kHz?
+"""Benchmark of a whole cell of real processes over real DDS: whether this machine keeps 1 kHz.
 
 The cell consists of loader, contact node, a palpating tool, a cloud viewer and, on request, a
 slider of the material. A loop that only sleeps runs beside them and shows which periods the machine

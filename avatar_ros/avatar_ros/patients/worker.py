@@ -89,7 +89,6 @@ def build(
     AvatarError, OSError
         If nothing was written.
     """
-
     first, base = "", atlas.base
 
     def report(stage: str, fraction: float, error: float) -> None:
