@@ -19,62 +19,41 @@ may run.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from avatar_core.atlas.growth import create_atlas as create_atlas
-    from avatar_core.atlas.growth import extend_atlas as extend_atlas
-    from avatar_core.atlas.model import Atlas as Atlas
-    from avatar_core.atlas.patient import Patient as Patient
-    from avatar_core.atlas.patient import PatientOptions as PatientOptions
-    from avatar_core.atlas.patient import patient_vademecum as patient  # noqa: F401
-    from avatar_core.atlas.storage import load_atlas as load_atlas
-    from avatar_core.contact.model import ContactData as ContactData
-    from avatar_core.contact.model import ContactModel as ContactModel
-    from avatar_core.contact.model import step as step
-    from avatar_core.contact.status import Status as Status
-    from avatar_core.errors import AvatarError as AvatarError
-    from avatar_core.fem.elasticity import Material as Material
-    from avatar_core.geometry.phantom import phantom_liver as phantom_liver
-    from avatar_core.geometry.surface import SurfaceMesh as SurfaceMesh
-    from avatar_core.geometry.surface import read_surface as read_surface
-    from avatar_core.geometry.tip import Tip as Tip
-    from avatar_core.pipeline import OrganOptions as OrganOptions
-    from avatar_core.pipeline import build as build
-    from avatar_core.scene.export import export as export
-    from avatar_core.scene.file import read_scene as read_scene
-    from avatar_core.scene.model import Scene as Scene
-    from avatar_core.scene.model import Tool as Tool
-    from avatar_core.scene.prepare import prepare as prepare
-    from avatar_core.vademecum.accuracy import Budget as Budget
-    from avatar_core.vademecum.at_values import at_values as at_values
-    from avatar_core.vademecum.certificate import Certificate as Certificate
-    from avatar_core.vademecum.model import Vademecum as Vademecum
-    from avatar_core.vademecum.storage import load_vademecum as load  # noqa: F401
-    from avatar_core.vademecum.storage import save_vademecum as save  # noqa: F401
+from avatar_core.common.lazy import lazy
 
 # Imported when first asked for: the command and the nodes start without compiling or meshing.
 _ORIGIN = {
     "Atlas": "atlas.model",
     "AvatarError": "errors",
     "Budget": "vademecum.accuracy",
+    "BuildRule": "offline.rule",
+    "Calibration": "uncertainty.calibration",
     "Certificate": "vademecum.certificate",
+    "Cloud": "registration.cloud",
     "ContactData": "contact.model",
     "ContactModel": "contact.model",
+    "Coordinate": "reduction.coordinates",
+    "CutSurface": "geometry.cut_surface",
+    "LargeRule": "offline.large_deformation",
     "Material": "fem.elasticity",
     "OrganOptions": "pipeline",
     "Patient": "atlas.patient",
     "PatientOptions": "atlas.patient",
+    "Registered": "registration.register",
+    "RegistrationRule": "registration.fit",
     "Scene": "scene.model",
     "Status": "contact.status",
+    "SupportOption": "offline.supports",
     "SurfaceMesh": "geometry.surface",
     "Tip": "geometry.tip",
     "Tool": "scene.model",
     "Vademecum": "vademecum.model",
-    "at_values": "vademecum.at_values",
     "build": "pipeline",
+    "calibrate": "uncertainty.calibration",
     "create_atlas": "atlas.growth",
+    "effects": "contact.effects:",
     "export": "scene.export",
     "extend_atlas": "atlas.growth",
     "load": "vademecum.storage:load_vademecum",
@@ -82,23 +61,60 @@ _ORIGIN = {
     "patient": "atlas.patient:patient_vademecum",
     "phantom_liver": "geometry.phantom",
     "prepare": "scene.prepare",
+    "read_cloud": "registration.cloud",
     "read_scene": "scene.file",
     "read_surface": "geometry.surface",
+    "register": "registration.register",
     "save": "vademecum.storage:save_vademecum",
     "step": "contact.model",
+    "uncertainty": "uncertainty:",
 }
 
 __all__ = [*_ORIGIN]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _ORIGIN:
-        raise AttributeError(f"module 'avatar_core' has no attribute '{name}'")
-    module, _, own = _ORIGIN[name].partition(":")
-    found = getattr(import_module(f"avatar_core.{module}"), own or name)
-    globals()[name] = found  # also where a room of this name was imported before
-    return found
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+if TYPE_CHECKING:
+    from avatar_core import uncertainty as uncertainty
+    from avatar_core.atlas.growth import create_atlas as create_atlas
+    from avatar_core.atlas.growth import extend_atlas as extend_atlas
+    from avatar_core.atlas.model import Atlas as Atlas
+    from avatar_core.atlas.patient import Patient as Patient
+    from avatar_core.atlas.patient import PatientOptions as PatientOptions
+    from avatar_core.atlas.patient import patient_vademecum as patient  # noqa: F401
+    from avatar_core.atlas.storage import load_atlas as load_atlas
+    from avatar_core.contact import effects as effects
+    from avatar_core.contact.model import ContactData as ContactData
+    from avatar_core.contact.model import ContactModel as ContactModel
+    from avatar_core.contact.model import step as step
+    from avatar_core.contact.status import Status as Status
+    from avatar_core.errors import AvatarError as AvatarError
+    from avatar_core.fem.elasticity import Material as Material
+    from avatar_core.geometry.cut_surface import CutSurface as CutSurface
+    from avatar_core.geometry.phantom import phantom_liver as phantom_liver
+    from avatar_core.geometry.surface import SurfaceMesh as SurfaceMesh
+    from avatar_core.geometry.surface import read_surface as read_surface
+    from avatar_core.geometry.tip import Tip as Tip
+    from avatar_core.offline.large_deformation import LargeRule as LargeRule
+    from avatar_core.offline.rule import BuildRule as BuildRule
+    from avatar_core.offline.supports import SupportOption as SupportOption
+    from avatar_core.pipeline import OrganOptions as OrganOptions
+    from avatar_core.pipeline import build as build
+    from avatar_core.reduction.coordinates import Coordinate as Coordinate
+    from avatar_core.registration.cloud import Cloud as Cloud
+    from avatar_core.registration.cloud import read_cloud as read_cloud
+    from avatar_core.registration.fit import RegistrationRule as RegistrationRule
+    from avatar_core.registration.register import Registered as Registered
+    from avatar_core.registration.register import register as register
+    from avatar_core.scene.export import export as export
+    from avatar_core.scene.file import read_scene as read_scene
+    from avatar_core.scene.model import Scene as Scene
+    from avatar_core.scene.model import Tool as Tool
+    from avatar_core.scene.prepare import prepare as prepare
+    from avatar_core.uncertainty.calibration import Calibration as Calibration
+    from avatar_core.uncertainty.calibration import calibrate as calibrate
+    from avatar_core.vademecum.accuracy import Budget as Budget
+    from avatar_core.vademecum.certificate import Certificate as Certificate
+    from avatar_core.vademecum.model import Vademecum as Vademecum
+    from avatar_core.vademecum.storage import load_vademecum as load  # noqa: F401
+    from avatar_core.vademecum.storage import save_vademecum as save  # noqa: F401
+else:
+    __getattr__, __dir__ = lazy(__name__, _ORIGIN)

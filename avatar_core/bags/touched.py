@@ -19,7 +19,7 @@ from avatar_core.errors import StorageError
 from avatar_core.geometry.tip import Tip
 from avatar_core.scene.recording import load_recording
 from avatar_core.scene.replay import scene_of
-from avatar_core.uncertainty.calibration import Errors, calibrated, touch_table
+from avatar_core.uncertainty.calibration import TouchErrors, calibrated, touch_table
 from avatar_core.uncertainty.calibration_report import numbers, verdict
 from avatar_core.uncertainty.distributions import parse
 from avatar_core.uncertainty.known import priors_of
@@ -159,8 +159,8 @@ def _of_recording(file: TouchFile) -> Touched:
 
 
 def palpated(
-    organ: Vademecum, touched: Touched, errors: Errors
-) -> tuple[Palpation, Errors, tuple[str, ...]]:
+    organ: Vademecum, touched: Touched, errors: TouchErrors
+) -> tuple[Palpation, TouchErrors, tuple[str, ...]]:
     """Return the touches of a file without the sensor's zero and lag, their errors, and all notes.
 
     Raises
@@ -196,7 +196,7 @@ def calibrated_files(
     touched = read_touched(TouchFile(recording, tool, transform, radius or RADIUS))
     organ = load_vademecum(vademecum)
     priors = priors_of(organ, known)
-    palpation, errors, _ = palpated(organ, touched, Errors())
+    palpation, errors, _ = palpated(organ, touched, TouchErrors())
     table = touch_table(organ, touched.tip, palpation)
     found = calibrated(table, priors, errors)
     return numbers(table, found) | {"verdict": verdict(table, found)[0]}

@@ -9,7 +9,6 @@ import numpy as np
 from avatar_core.certify.linear import certificate_of, measured
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.reduction.coordinates import Coordinate, problem_at
-from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.certificate import Certificate
 from avatar_core.vademecum.model import Vademecum
 
@@ -32,7 +31,7 @@ def certify_range(
     n_each = max(1, n_loads // len(values))
     found = []
     for k, point in enumerate(values):
-        here = at_values(vademecum, point)
+        here = vademecum.at(point)
         found.append(measured(here, problem_at(elasticity, point), n_each, seed + k))
         progress((k + 1) * n_each)
     return certificate_of(vademecum, found, seed)

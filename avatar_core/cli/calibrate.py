@@ -85,7 +85,7 @@ def calibrate(
 ) -> None:
     """Find Young's modulus and the coordinates of a vademecum from touches with measured forces."""
     from avatar_core.bags.touched import TouchFile, palpated, read_touched
-    from avatar_core.uncertainty.calibration import Errors, calibrated, touch_table
+    from avatar_core.uncertainty.calibration import TouchErrors, calibrated, touch_table
     from avatar_core.uncertainty.calibration_report import say
     from avatar_core.uncertainty.known import priors_of
     from avatar_core.vademecum.storage import load_vademecum
@@ -104,7 +104,7 @@ def calibrate(
         touched = read_touched(TouchFile(recording, tool, transform, 1e-3 * radius), progress)
     vademecum = load_vademecum(file)
     priors = priors_of(vademecum, known)
-    errors = Errors(sensor, least, 1e-3 * depth, extent=extent)
+    errors = TouchErrors(sensor, least, 1e-3 * depth, extent=extent)
     palpation, errors, notes = palpated(vademecum, touched, errors)
     with progress_bar("materials") as progress:
         table = touch_table(vademecum, touched.tip, palpation, progress)

@@ -108,7 +108,6 @@ def register(
     from avatar_core.registration.cloud import read_cloud
     from avatar_core.registration.fit import RegistrationRule
     from avatar_core.registration.register import register as registered_to
-    from avatar_core.registration.register import target_at
     from avatar_core.scene.export import FORMATS
     from avatar_core.scene.surface_export import SURFACE_FORMATS
     from avatar_core.vademecum.storage import load_vademecum
@@ -133,15 +132,15 @@ def register(
     vademecum = load_vademecum(file)
     found = registered_to(vademecum, cloud, rule)
     say_notices(tuple(line for line in found.notices if line not in cloud.notices))
-    given = [] if target is None else [target_at(vademecum, found, target)]  # type: ignore[arg-type]
-    estimates = given or _shown(vademecum, found)
+    given = [] if target is None else [found.target_at(target)]
+    estimates = given or found.targets() or [found.largest()]
     largest_move = float(abs(found.displacement).max())
     if largest_move > LARGE and not found.problems:
         said = f"notice: displaced by up to {1e3 * largest_move:.0f} mm: small strains leave out "
         print(f"{said}some {found.model_error:.0%}, which is in the intervals", file=sys.stderr)
     missing = found.undetermined(estimates)
     if as_json:
-        print(json.dumps(plain(_summary(vademecum, found, estimates)), indent=2))
+        print(json.dumps(plain(_summary(found, estimates)), indent=2))
     if found.problems:  # no place is told, nor written
         print(_verdict(found, missing), file=sys.stderr if as_json else sys.stdout)
         raise typer.Exit(EXIT_NOT_EXPLAINED)
@@ -150,12 +149,6 @@ def register(
         print("; ".join([*map(_sentence, estimates), _verdict(found, missing)]))
     if missing:
         raise typer.Exit(EXIT_NOT_DETERMINED)
-
-
-def _shown(vademecum: Vademecum, found: Registered) -> list[Estimate]:
-    from avatar_core.registration.register import largest, targets
-
-    return targets(vademecum, found) or [largest(found)]
 
 
 def _sentence(one: Estimate) -> str:
@@ -217,11 +210,9 @@ def _write(vademecum: Vademecum, found: Registered, output: Path) -> None:
     write_surfaces(vademecum, output, place, fields=shown)
 
 
-def _summary(vademecum: Vademecum, found: Registered, estimates: list[Estimate]) -> dict[str, Any]:
+def _summary(found: Registered, estimates: list[Estimate]) -> dict[str, Any]:
     """Return all figures; lengths in m, angles in degrees, forces in N."""
     import numpy as np
-
-    from avatar_core.registration.register import strongest_forces
 
     fit = found.fit
     scale, length, noise, mismatch = fit.scales.tolist()
@@ -239,7 +230,7 @@ def _summary(vademecum: Vademecum, found: Registered, estimates: list[Estimate])
         "undetermined": list(found.undetermined(estimates)),
         "determined_unseen": float(np.mean(found.is_determined[np.logical_not(found.seen)])),
         "problems": list(found.problems),
-        "forces": [asdict(one) for one in strongest_forces(vademecum, found)],
+        "forces": [asdict(one) for one in found.strongest_forces()],
         "scales": {
             of_loads: scale,
             "traction_length": length,

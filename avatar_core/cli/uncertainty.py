@@ -55,8 +55,7 @@ def uncertainty(
 ) -> None:
     """Show within which bands force and displacement lie, and which parameter makes them wide."""
     from avatar_core.geometry.tip import Tip
-    from avatar_core.uncertainty.bands import bands_of
-    from avatar_core.uncertainty.force_table import force_table
+    from avatar_core.uncertainty.bands import force_bands
     from avatar_core.uncertainty.known import known_of
     from avatar_core.uncertainty.report import picture, rows, say
     from avatar_core.vademecum.storage import load_vademecum
@@ -69,16 +68,16 @@ def uncertainty(
     known = given_of(given)
     vademecum = load_vademecum(file)
     known = known_of(vademecum, known)
-    places, vertex = _places(vademecum, at), _target(vademecum, target)
+    points = _points(vademecum, at)
+    wanted = "three numbers, as 0,0.05,0"
+    aim = None if target is None else numbers("--target", target, (3,), wanted)
     with progress_bar("materials") as show:
-        table = force_table(vademecum, tip, places, pressed, vertex, show)
-    bands = bands_of(table, known, draws, seed)
-    centers = vademecum.surface.centers[places]
-    say(vademecum.name, draws, known, centers, pressed, bands)
+        bands = force_bands(vademecum, known, points, pressed, tip, aim, draws, seed, show)
+    say(vademecum.name, draws, known, pressed, bands)
     if output is not None and output.suffix == ".json":
-        output.write_text(json.dumps(rows(centers, pressed, bands), indent=1) + "\n")
+        output.write_text(json.dumps(rows(pressed, bands), indent=1) + "\n")
     elif output is not None:
-        picture(output, vademecum.name, known, centers, pressed, bands)
+        picture(output, vademecum.name, known, pressed, bands)
     if output is not None:
         print(output)
 
@@ -108,35 +107,10 @@ def _depths(text: str) -> list[float]:
     return [1e-3 * depth for depth in found]
 
 
-def _places(vademecum: Vademecum, at: list[str] | None) -> list[int]:
-    """Load positions that are pressed."""
-    import numpy as np
-
+def _points(vademecum: Vademecum, at: list[str] | None) -> list[list[float]]:
+    """Where the tip presses [m]."""
     from avatar_core.contact.tool_path import starts_apart
 
     if not at:
-        return starts_apart(vademecum, 3)
-    centers, found = vademecum.surface.centers, []
-    for text in at:
-        point = numbers("--at", text, (3,), "three numbers, as 0,0.07,0.005")
-        vademecum.surface.nearest(point)  # refuses what lies off the surface
-        found.append(int(np.argmin(np.linalg.norm(centers - point, axis=1))))
-    return found
-
-
-def _target(vademecum: Vademecum, text: str | None) -> int:
-    """Return the vertex whose displacement is asked for."""
-    import numpy as np
-
-    vertices = vademecum.mesh.vertices
-    if text is not None:
-        point = np.array(numbers("--target", text, (3,), "three numbers, as 0,0.05,0"))
-        inside = (point >= vertices.min(axis=0)) & (point <= vertices.max(axis=0))
-        require(bool(inside.all()), f"--target is {text}, outside of the organ; give a point in it")
-    elif vademecum.structures:
-        assert vademecum.display is not None  # which holds them
-        (faces, *_) = vademecum.structures.values()
-        point = vademecum.display.vertices[np.unique(faces)].mean(axis=0)
-    else:
-        point = vertices.mean(axis=0)
-    return int(np.argmin(np.linalg.norm(vertices - point, axis=1)))
+        return vademecum.surface.centers[starts_apart(vademecum, 3)].tolist()
+    return [numbers("--at", text, (3,), "three numbers, as 0,0.07,0.005") for text in at]

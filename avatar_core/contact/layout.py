@@ -20,7 +20,7 @@ from avatar_core.contact.effects import (
     Effect,
     Friction,
     Grasp,
-    LargeDeformationEffect,
+    LargeDeformation,
     SeveralTools,
     Tumour,
 )
@@ -38,7 +38,7 @@ from avatar_core.vademecum.certificate import Certificate
 
 if TYPE_CHECKING:
     from avatar_core.tips.law import ShapeFactor
-    from avatar_core.vademecum.large_deformation import LargeDeformation
+    from avatar_core.vademecum import large_deformation
     from avatar_core.vademecum.model import Vademecum
 
 LANES = 32  # float32 numbers that a vectorised loop processes at once
@@ -156,7 +156,7 @@ def lay_out(
     load = vademecum.contact_load.reshape(surface.n_positions, 3, -1)
     modulus = vademecum.material.plane_strain_modulus
     response = make_tip_response(surface, field, shape.carriers, load, contact, modulus)
-    large = vademecum.large if find(chosen, LargeDeformationEffect) else None
+    large = vademecum.large if find(chosen, LargeDeformation) else None
     shown = cloud_arrays(vademecum, detail.cloud, large.terms if large else None)
     display = vademecum.display if detail.cloud == "surface" else None
     vertices = shown_vertices(vademecum, detail.cloud)
@@ -220,7 +220,7 @@ def default_effects(vademecum: Vademecum, tips: Sequence[Tip]) -> tuple[Effect, 
     """Return effects of a scene that names none: those that the vademecum and the tools require."""
     effects: list[Effect] = []
     if vademecum.large is not None:
-        effects.append(LargeDeformationEffect())
+        effects.append(LargeDeformation())
     if vademecum.contrast is not None:
         effects.append(Tumour())
     if len(tips) > 1:
@@ -247,7 +247,9 @@ def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:
 
 
 def force_error_grid(
-    certificate: Certificate | None, large: LargeDeformation | None, smoothing: np.ndarray
+    certificate: Certificate | None,
+    large: large_deformation.LargeDeformation | None,
+    smoothing: np.ndarray,
 ) -> np.ndarray:
     """Return the relative error of the force on the grid of the tip field; NaN if it is not known.
 

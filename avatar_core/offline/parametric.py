@@ -39,7 +39,6 @@ from avatar_core.reduction.coordinates import RESECTION, Coordinate, node_values
 from avatar_core.reduction.near_field import LocalBlocks
 from avatar_core.reduction.regional import RegionalRule, RegionModes, separate_regions
 from avatar_core.reduction.separated import SeparatedField
-from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.display import Display, blocks_to_display
 from avatar_core.vademecum.modal_mass import (
     LEAST_MODES,
@@ -125,7 +124,7 @@ def build_parametric_vademecum(
     organ = _Organ(name, elasticity, regions, surface, blocks, tip_field)
     vademecum = _assemble(organ, tuple(coordinates), rule, snapshots, basis)
     vademecum = replace(vademecum, provenance=provenance, display=display)
-    return at_values(vademecum, _inside(coordinates, elasticity))
+    return vademecum.at(_inside(coordinates, elasticity))
 
 
 def _part(progress: Progress, k: int, nodes: Sequence[object]) -> Progress:

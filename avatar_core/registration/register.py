@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import RegistrationError
@@ -67,24 +68,34 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False)
+class PlaceForce:
+    """Force on a part of the surface: its middle (3,) [m] at rest, and a vector (3,) [N]."""
+
+    point: FloatArray
+    force: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Registered:
     """A vademecum registered to a cloud.
 
     Attributes
     ----------
+    vademecum : Vademecum
+        Vademecum that was registered.
     fit : Fit
         Its loads, motion and residuals.
     displacement : ndarray, shape (n_vertices, 3)
         Displacement [m], by deformation, along the axes at rest.
     place : ndarray, shape (n_vertices, 3)
-        Place [m], of the vertices in the cloud's frame.
+        Places of the vertices in the cloud's frame [m].
     displacement_spread, place_spread : ndarray, shape (n_vertices, 3, k)
-        Displacement spread and place spread [m], square roots of the posterior covariance, S S^T of
-        any vertices together.
+        Square roots of the posterior covariance [m]; S S^T is that
+        of any vertices together.
     model_error : float
         Relative, by the vademecum's certificate and by what small strains leave out.
     away : ndarray, shape (n_vertices,)
-        Away of each place from the nearest point of the cloud [m].
+        Distance of each place from the nearest point of the cloud [m].
     within : float
         Bound of the rule, within which a place is determined [m].
     problems : tuple[str, ...]
@@ -93,6 +104,7 @@ class Registered:
         What else there is to know, one line each.
     """
 
+    vademecum: Vademecum
     fit: Fit
     displacement: FloatArray
     place: FloatArray
@@ -204,14 +216,75 @@ class Registered:
             own,
         )
 
+    def target_at(self, point: ArrayLike) -> Estimate:
+        """Where a point of the organ has gone.
+
+        Parameters
+        ----------
+        point : array_like, shape (3,)
+            Point of the organ at rest [m].
+
+        Raises
+        ------
+        RegistrationError
+            If the point lies more than 5 mm outside the organ.
+        """
+        asked = np.asarray(point, float)
+        corners, weights = carriers(self.vademecum.mesh, asked[None])
+        found = self.estimate("target", corners[0], weights[0])
+        off = float(np.linalg.norm(found.rest - asked))
+        if off > _INSIDE:
+            raise RegistrationError(
+                f"the target lies {1e3 * off:.0f} mm outside the organ; give a point in it, in "
+                "metres"
+            )
+        return found
+
+    def targets(self) -> list[Estimate]:
+        """Where the middles of structures inside, such as tumours, have gone."""
+        display, found = self.vademecum.display, []
+        for name, faces in self.vademecum.structures.items():
+            assert display is not None
+            used = np.unique(faces)
+            weights = np.asarray(display.weights[used], float).ravel() / len(used)
+            found.append(self.estimate(name, display.corners[used].ravel(), weights))
+        return found
+
+    def largest(self) -> Estimate:
+        """Where the vertex that the deformation displaces most has gone."""
+        vertex = int((self.displacement**2).sum(axis=1).argmax())
+        return self.estimate("largest displacement", np.array([vertex]), np.ones(1))
+
+    def strongest_forces(self, n: int = 3) -> tuple[PlaceForce, ...]:
+        """Forces within two patch radii of the places that are pressed or pulled hardest."""
+        surface = self.vademecum.surface
+        forces = self.fit.loads.at_positions(self.fit.coefficients)
+        reach = 2.0 * surface.patch_radius
+        apart = np.linalg.norm(surface.centers[:, None] - surface.centers[None], axis=2)
+        sums = (apart < reach) @ forces
+        strongest = surface.largest_apart(np.linalg.norm(sums, axis=1), n, 2.0 * reach)
+        return tuple(PlaceForce(surface.centers[k], sums[k]) for k in strongest)
+
 
 def register(
-    vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule | None = None
+    vademecum: Vademecum, cloud: Cloud | ArrayLike, rule: RegistrationRule | None = None
 ) -> Registered:
     """Bring an organ to a cloud of points on its deformed surface.
 
     The response is that of small strains, also where a vademecum has the load's magnitude as a
     coordinate; what that leaves out is part of the standard deviations.
+
+    Parameters
+    ----------
+    vademecum : Vademecum
+    cloud : Cloud or array_like, shape (n, 3)
+        Points in any order [m], at least 50, aligned to about 10 mm and 10 degrees.
+    rule : RegistrationRule, optional
+        Prior knowledge of noise, motion and loads.
+
+    Returns
+    -------
+    Registered
 
     Raises
     ------
@@ -219,6 +292,7 @@ def register(
         If the cloud cannot be one of this organ.
     """
     rule = rule or RegistrationRule()
+    cloud = cloud if isinstance(cloud, Cloud) else Cloud(np.asarray(cloud, float))
     problem, notices = posed(vademecum, cloud, rule)
     found, rival = chosen(problem)
     n, motion, mesh = found.loads.size, found.motion, vademecum.mesh
@@ -239,6 +313,7 @@ def register(
     error = float(np.hypot(error, SMALL_STRAINS_OFF * mean_gradient(mesh, displacement)))
     apart = np.linalg.norm(place[:, None] - cloud_part(problem.points)[None], axis=2).min(axis=1)
     return Registered(
+        vademecum,
         found,
         displacement,
         place,
@@ -259,62 +334,6 @@ def _beside(spread: FloatArray, column: FloatArray) -> FloatArray:
 def cloud_part(points: FloatArray) -> FloatArray:
     """Some 500 points of a cloud, by which distances to it are judged."""
     return points[:: max(1, len(points) // 500)]
-
-
-def targets(vademecum: Vademecum, registered: Registered) -> list[Estimate]:
-    """Return the middles of structures inside, such as tumours."""
-    display, found = vademecum.display, []
-    for name, faces in vademecum.structures.items():
-        assert display is not None
-        used = np.unique(faces)
-        weights = np.asarray(display.weights[used], float).ravel() / len(used)
-        found.append(registered.estimate(name, display.corners[used].ravel(), weights))
-    return found
-
-
-def target_at(vademecum: Vademecum, registered: Registered, point: FloatArray) -> Estimate:
-    """Return a point of the organ at rest [m].
-
-    Raises
-    ------
-    RegistrationError
-        If it lies more than 5 mm outside.
-    """
-    corners, weights = carriers(vademecum.mesh, np.asarray(point, float)[None])
-    found = registered.estimate("target", corners[0], weights[0])
-    off = float(np.linalg.norm(found.rest - point))
-    if off > _INSIDE:
-        raise RegistrationError(
-            f"the target lies {1e3 * off:.0f} mm outside the organ; give a point in it, in metres"
-        )
-    return found
-
-
-def largest(registered: Registered) -> Estimate:
-    """Return the vertex that the deformation displaces most."""
-    vertex = int((registered.displacement**2).sum(axis=1).argmax())
-    return registered.estimate("largest displacement", np.array([vertex]), np.ones(1))
-
-
-@dataclass(frozen=True, eq=False)
-class PlaceForce:
-    """Force on a part of the surface: its middle (3,) [m] at rest, and a vector (3,) [N]."""
-
-    point: FloatArray
-    force: FloatArray
-
-
-def strongest_forces(
-    vademecum: Vademecum, registered: Registered, n: int = 3
-) -> tuple[PlaceForce, ...]:
-    """Return the forces within two patch radii of the places that are pressed or pulled hardest."""
-    surface, found = vademecum.surface, registered.fit
-    forces = found.loads.at_positions(found.coefficients)
-    reach = 2.0 * surface.patch_radius
-    apart = np.linalg.norm(surface.centers[:, None] - surface.centers[None], axis=2)
-    sums = (apart < reach) @ forces
-    strongest = surface.largest_apart(np.linalg.norm(sums, axis=1), n, 2.0 * reach)
-    return tuple(PlaceForce(surface.centers[k], sums[k]) for k in strongest)
 
 
 def _roots(vademecum: Vademecum, found: Fit) -> FloatArray:

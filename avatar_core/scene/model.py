@@ -154,7 +154,7 @@ class Scene:
 
     @property
     def values(self) -> dict[str, float]:
-        """Values of material and supports that the scene chooses, for ``at_values``.
+        """Values of material and supports that the scene chooses, for ``Vademecum.at``.
 
         The contrast is that of the effect ``tumour``.
         """
@@ -249,7 +249,8 @@ def _figure(certificate: Any, key: str | None) -> float | None:
 def _require_coordinate(vademecum: Vademecum, key: str, name: str, value: float) -> None:
     """Refuse a value of a coordinate that the vademecum has not, or out of its range.
 
-    The range of a support is that at Young's modulus of the vademecum: ``at_values`` knows others.
+    The range of a support is that at the vademecum's Young's modulus; ``Vademecum.at`` checks
+    others.
     """
     coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
     try:

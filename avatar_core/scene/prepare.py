@@ -15,7 +15,6 @@ from avatar_core.contact.model import ContactModel
 from avatar_core.geometry.tip import Tip
 from avatar_core.scene.model import Scene
 from avatar_core.vademecum.accuracy import AccuracyCurve, Budget, Cloud, Detail, choose
-from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 
 
@@ -75,7 +74,7 @@ def default_spec(
     values : Mapping[str, float] or None
         Values of the material, by coordinate.
     """
-    chosen = at_values(vademecum, values or {})
+    chosen = vademecum.at(values or {})
     return ModelSpec(chosen, tips, modes, cloud, default_effects(chosen, tips))
 
 
@@ -99,7 +98,7 @@ def scene_spec(
         others = [effect for effect in scene.effects if effect.name != Tumour.name]
         scene = replace(scene, effects=(*others, Tumour(given.pop("contrast"))))
     scene.require(vademecum)
-    chosen = at_values(vademecum, scene.values | given)
+    chosen = vademecum.at(scene.values | given)
     tips = tuple(tool.tip for tool in scene.tools)
     return ModelSpec(chosen, tips, scene.modes, scene.cloud, scene.effects)
 

@@ -31,7 +31,7 @@ from avatar_core.pipeline import OrganOptions, build
 from avatar_core.reduction.coordinates import Coordinate, problem_at
 from avatar_core.studies.certainty_section import CertaintySettings, Section
 from avatar_core.studies.study import Panel, ProgressBar, Row, column, follow
-from avatar_core.uncertainty.calibration import Errors, TouchTable, calibrated, touch_table
+from avatar_core.uncertainty.calibration import TouchErrors, TouchTable, calibrated, touch_table
 from avatar_core.uncertainty.distributions import Distribution, Fixed
 from avatar_core.uncertainty.known import priors_of
 from avatar_core.uncertainty.palpation import Palpation
@@ -51,7 +51,7 @@ WELL_KNOWN = 0.05  # error of a force that nine in ten keep, where a touch is wo
 NOISE = 0.02  # of a measured force
 DEPTHS = (2e-3, 4e-3, 6e-3)  # [m]
 TIP = Tip("patch", 8e-3)
-ERRORS = Errors(sensor=NOISE, least=1e-6, depth=0.1e-3)  # poses and surface are exact here
+ERRORS = TouchErrors(sensor=NOISE, least=1e-6, depth=0.1e-3)  # poses and surface are exact here
 _ABOVE, _STEP = 2e-3, 1e-3  # where a touch begins, and between its points [m]
 _SHRUNK, _BELOW = 0.35, 28e-3  # the tumour: of the organ's size, its middle below the surface [m]
 _N_TRUE_VERTICES = 5000

@@ -31,7 +31,6 @@ from avatar_core.reduction.coordinates import Coordinate, problem_at
 from avatar_core.studies.certainty_section import CertaintySettings, Section
 from avatar_core.studies.organ import Organ
 from avatar_core.studies.study import Panel, ProgressBar, Row, column, follow, where
-from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 
 if TYPE_CHECKING:
@@ -115,7 +114,7 @@ def _errors(
 ) -> tuple[FloatArray, FloatArray]:
     """L2 of the displacement (3 n,) and of the contact compliance (n,) at centroids of faces."""
     name, surface, mesh = held.coordinate.name, held.loads, held.elasticity.mesh
-    problem, here = problem_at(held.elasticity, {name: value}), at_values(vademecum, {name: value})
+    problem, here = problem_at(held.elasticity, {name: value}), vademecum.at({name: value})
     loads = patch_loads(problem, surface.centroids[faces], surface.patch_radius)
     solution = problem.solve(loads)
     own = (loads.T @ solution).reshape(len(faces), 3, len(faces), 3)

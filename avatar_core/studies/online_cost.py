@@ -19,7 +19,7 @@ import numpy as np
 
 from avatar_core.certify.accuracy_curve import StepErrors
 from avatar_core.certify.unseen_contacts import UnseenContacts, draw_contacts
-from avatar_core.contact.effects import LargeDeformationEffect
+from avatar_core.contact.effects import LargeDeformation
 from avatar_core.contact.organ_response import closest_weights
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_norm, relative_l2
@@ -188,7 +188,7 @@ def _optimum_rows(
 def cost_of_effects(vademecum: Vademecum) -> list[Row]:
     """Times of a step with each effect alone that a linear vademecum serves, surface and volume."""
     every = cases_on(vademecum)
-    cases = [case for case in every if not isinstance(case[2][0], LargeDeformationEffect)]
+    cases = [case for case in every if not isinstance(case[2][0], LargeDeformation)]
     return [
         {
             "stage": "effects",

@@ -27,7 +27,6 @@ from avatar_core.reduction.coordinates import RESECTION, Coordinate, problem_at
 from avatar_core.studies.organ import Organ
 from avatar_core.studies.shapes import read_liver
 from avatar_core.studies.study import ProgressBar, Row, Run, Study, column, label, where
-from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.modal_mass import sag_of
 from avatar_core.vademecum.model import Vademecum
 
@@ -159,7 +158,7 @@ def _rows(vademecum: Vademecum, organ: Organ, settings: ResectionSettings) -> li
     whole = _truths(vademecum, organ.elasticity, settings.n_loads)
     for k, step in enumerate(steps):
         opened = step / last
-        here = at_values(vademecum, {RESECTION: opened})
+        here = vademecum.at(resection=opened)
         problem = problem_at(organ.elasticity, {RESECTION: opened})
         found = measured(here, problem, settings.n_loads, seed=k)
         loads, sag = _truths(vademecum, problem, settings.n_loads)

@@ -7,15 +7,20 @@ ln F that would go if the parameter were known.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.stats import qmc, sobol_indices
 
 from avatar_core.common.arrays import FloatArray
+from avatar_core.errors import ContactError
+from avatar_core.geometry.tip import MAX_DEPTH, Tip
 from avatar_core.uncertainty.distributions import Distribution, Fixed
-from avatar_core.uncertainty.force_table import ForceTable
+from avatar_core.uncertainty.force_table import ForceTable, force_table
+from avatar_core.uncertainty.known import known_of
+from avatar_core.vademecum.model import Vademecum
 
 LOW, HIGH = 0.05, 0.95  # the probabilities of a band's edges
 _INDEX_DRAWS = 1024  # for each parameter, a power of two
@@ -23,19 +28,104 @@ _INDEX_DRAWS = 1024  # for each parameter, a power of two
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """Of every place and depth.
+    """Bands of force and displacement, for every place and depth.
 
     Attributes
     ----------
-    force, moved : ndarray, shape (3, n_places, n_depths)
-        Force and moved at 5, 50 and 95 % [N, m].
-    shares : Mapping[str, ndarray]
-        By parameter that is not fixed, ndarray (n_places, n_depths), of the force.
+    places : ndarray, shape (n_places, 3)
+        Load positions that are pressed [m].
+    force : ndarray, shape (3, n_places, n_depths)
+        Force on the tip at 5, 50 and 95 % [N].
+    moved : ndarray, shape (3, n_places, n_depths)
+        Displacement of the target at 5, 50 and 95 % [m].
+    shares : mapping of str to ndarray, shape (n_places, n_depths)
+        Share of each parameter that is not fixed in the variance of ln F [-].
     """
 
+    places: FloatArray
     force: FloatArray
     moved: FloatArray
     shares: Mapping[str, FloatArray]
+
+
+def force_bands(
+    vademecum: Vademecum,
+    known: Mapping[str, Distribution],
+    points: ArrayLike,
+    depths: ArrayLike,
+    tip: Tip | None = None,
+    target: ArrayLike | None = None,
+    draws: int = 1000,
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Bands:
+    """Bands of the force on a tip, and of the displacement of a target, for uncertain material.
+
+    Parameters
+    ----------
+    vademecum : Vademecum
+    known : mapping of str to Distribution
+        Young's modulus and coordinates of the vademecum, by name. A parameter that is not given
+        keeps the vademecum's value.
+    points : array_like, shape (n_places, 3)
+        Where the tip presses [m]. The load position nearest to each point is taken.
+    depths : array_like, shape (n_depths,)
+        Depths of the tip below the surface, rising [m].
+    tip : Tip, optional
+        The default is a sphere of 5 mm.
+    target : array_like, shape (3,), optional
+        Point whose displacement is asked for [m]. The default is the tumour, or the middle of the
+        organ.
+    draws : int
+        Number of draws.
+    seed : int
+        Seed of the draws.
+    progress : callable
+        Called with the number of materials that are done, and of all.
+
+    Returns
+    -------
+    Bands
+
+    Raises
+    ------
+    LoadError
+        If a point lies more than 5 mm off the accessible surface.
+    ContactError
+        If the depths do not rise, the target lies outside the organ, or the tip feels nothing.
+    CoordinateError
+        If the vademecum has no such parameter.
+    """
+    deep = np.atleast_1d(np.asarray(depths, float))
+    if not (deep[0] > 0.0 and deep[-1] <= MAX_DEPTH and (np.diff(deep) > 0.0).all()):
+        raise ContactError(
+            f"depths are {deep.tolist()} m; give rising numbers above 0, up to {MAX_DEPTH:g}"
+        )
+    centers, places = vademecum.surface.centers, []
+    for point in np.asarray(points, float).reshape(-1, 3):
+        vademecum.surface.nearest(point)  # refuses what lies off the surface
+        places.append(int(np.argmin(np.linalg.norm(centers - point, axis=1))))
+    all_known, vertex = known_of(vademecum, known), _target(vademecum, target)
+    table = force_table(vademecum, tip or Tip(), places, deep.tolist(), vertex, progress)
+    return bands_of(table, all_known, draws, seed)
+
+
+def _target(vademecum: Vademecum, point: ArrayLike | None) -> int:
+    """The vertex whose displacement is asked for."""
+    vertices = vademecum.mesh.vertices
+    if point is not None:
+        at = np.asarray(point, float)
+        if not ((at >= vertices.min(axis=0)) & (at <= vertices.max(axis=0))).all():
+            raise ContactError(
+                f"the target {at.tolist()} lies outside of the organ; give a point in it, in metres"
+            )
+    elif vademecum.structures:
+        assert vademecum.display is not None  # which holds them
+        (faces, *_) = vademecum.structures.values()
+        at = vademecum.display.vertices[np.unique(faces)].mean(axis=0)
+    else:
+        at = vertices.mean(axis=0)
+    return int(np.argmin(np.linalg.norm(vertices - at, axis=1)))
 
 
 def drawn(known: Mapping[str, Distribution], n: int, seed: int) -> dict[str, FloatArray]:
@@ -51,6 +141,7 @@ def bands_of(
     """Return the bands that n draws span, and each parameter's share of the force's."""
     values, levels = drawn(known, n, seed), (LOW, 0.5, HIGH)
     return Bands(
+        table.places,
         np.quantile(table.force(values), levels, axis=0),
         np.quantile(table.moved(values), levels, axis=0),
         _shares(table, known, seed),

@@ -36,6 +36,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 from scipy.special import ndtr
@@ -47,8 +48,9 @@ from avatar_core.errors import ContactError
 from avatar_core.geometry.tip import Tip
 from avatar_core.uncertainty.distributions import Distribution, Fixed, Lognormal
 from avatar_core.uncertainty.fit_check import chance
+from avatar_core.uncertainty.known import priors_of
 from avatar_core.uncertainty.material_grid import MaterialGrid
-from avatar_core.uncertainty.palpation import Palpation
+from avatar_core.uncertainty.palpation import Palpation, palpation_of
 from avatar_core.vademecum.accuracy import Detail
 from avatar_core.vademecum.model import Vademecum
 
@@ -64,7 +66,7 @@ _TAIL = 4.0  # degrees of freedom of a vademecum's error over what it states
 
 
 @dataclass(frozen=True)
-class Errors:
+class TouchErrors:
     """Standard deviations of what is off about a force.
 
     Attributes
@@ -140,7 +142,7 @@ class TouchTable:
         )
 
     def covariance(
-        self, errors: Errors, log_force: FloatArray, inflated: FloatArray | None = None
+        self, errors: TouchErrors, log_force: FloatArray, inflated: FloatArray | None = None
     ) -> FloatArray:
         """Return C at forces that are expected, shape (n_samples, n_samples).
 
@@ -216,6 +218,52 @@ class Calibration:
         factor = np.sqrt(self.value(name, 1.0) / self.value(name, -1.0))
         middle = self.value(name)
         return Lognormal(middle, float(factor)) if factor > 1.0 else Fixed(middle)
+
+
+def calibrate(
+    vademecum: Vademecum,
+    tips: ArrayLike,
+    forces: ArrayLike,
+    tip: Tip | None = None,
+    known: Mapping[str, Distribution] | None = None,
+    errors: TouchErrors | None = None,
+) -> Calibration:
+    """Find Young's modulus and the other coordinates from touches with measured forces.
+
+    Parameters
+    ----------
+    vademecum : Vademecum
+    tips : array_like, shape (n, 3)
+        Places of the tip in the order of time [m], as :func:`avatar_core.contact.model.step` takes
+        them. Each touch begins outside the organ.
+    forces : array_like, shape (n,) or (n, 3)
+        Measured forces at these places, as sizes or vectors [N].
+    tip : Tip, optional
+        The default is a sphere of 5 mm.
+    known : mapping of str to Distribution, optional
+        What is known before, by name of a parameter. A parameter that is not given may lie
+        anywhere in the vademecum's range; Young's modulus lies between 500 Pa and 350 kPa.
+    errors : TouchErrors, optional
+        Standard deviations of sensor, surface and mesh.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    StorageError
+        If the forces hold no touch.
+    ContactError
+        If fewer than three touches meet the organ.
+    CoordinateError
+        If the vademecum has no such parameter.
+    """
+    size = np.asarray(forces, float)
+    size = np.linalg.norm(size, axis=1) if size.ndim == 2 else size
+    palpation = palpation_of(np.asarray(tips, float), size)
+    table = touch_table(vademecum, tip or Tip(), palpation)
+    return calibrated(table, priors_of(vademecum, known), errors)
 
 
 def touch_table(
@@ -305,7 +353,7 @@ def _steepness(palpation: Palpation, log_force: FloatArray) -> FloatArray:
 
 
 def calibrated(
-    table: TouchTable, known: Mapping[str, Distribution], errors: Errors | None = None
+    table: TouchTable, known: Mapping[str, Distribution], errors: TouchErrors | None = None
 ) -> Calibration:
     """Return the posterior of all parameters that are not fixed.
 
@@ -316,7 +364,7 @@ def calibrated(
         gives.
     """
     names = tuple(name for name, one in known.items() if not isinstance(one, Fixed))
-    errors = errors or Errors()
+    errors = errors or TouchErrors()
     # What Young's modulus has taken of the mesh's error is no misfit.
     own = replace(errors, mesh=0.0) if "young" in names else errors
 
@@ -355,7 +403,7 @@ def calibrated(
 
 
 def _extents(
-    known: Mapping[str, Distribution], names: tuple[str, ...], at: FloatArray, errors: Errors
+    known: Mapping[str, Distribution], names: tuple[str, ...], at: FloatArray, errors: TouchErrors
 ) -> FloatArray:
     """Variances of the standard normal numbers by ``errors.extent``, shape (n,), no larger than
     before anything was known.

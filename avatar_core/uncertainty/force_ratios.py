@@ -39,8 +39,8 @@ from avatar_core.tips.shape_factor import dense
 from avatar_core.uncertainty.bands import HIGH, LOW, drawn
 from avatar_core.uncertainty.distributions import Distribution, Fixed
 from avatar_core.uncertainty.material_grid import N_POINTS, MaterialGrid
-from avatar_core.vademecum.at_values import own_compliance, own_compliance_at
 from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.own_compliance import own_compliance, own_compliance_at
 
 DEPTHS = 0.5e-3 * 3.0 ** np.arange(4)  # for which forces are found [m]
 DRAWS = 1000

@@ -33,13 +33,17 @@ class ForceTable:
 
     Attributes
     ----------
+    grid : MaterialGrid
+    places : ndarray, shape (n_places, 3)
+        Load positions that are pressed [m].
     log_force : ndarray, shape (n_points, n_places, n_depths)
-        Ln of the force [N].
-    log_moved : ndarray of that
-        Shape, ln of the displacement of the target [m].
+        Logarithm of the force [N].
+    log_moved : ndarray, shape (n_points, n_places, n_depths)
+        Logarithm of the displacement of the target [m].
     """
 
     grid: MaterialGrid
+    places: FloatArray
     log_force: FloatArray
     log_moved: FloatArray
 
@@ -87,7 +91,12 @@ def force_table(
         moved.append(found * _motion(here, places, target)[:, None])
         progress(done + 1, grid.n_points)
     least = np.finfo(float).tiny  # where the target is clamped
-    return ForceTable(grid, np.log(force), np.log(np.maximum(moved, least)))
+    return ForceTable(
+        grid,
+        vademecum.surface.centers[list(places)],
+        np.log(force),
+        np.log(np.maximum(moved, least)),
+    )
 
 
 def _pressed(

@@ -21,7 +21,6 @@ import numpy as np
 
 from avatar_core.common.arrays import FloatArray
 from avatar_core.reduction.coordinates import Coordinate
-from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 
 N_POINTS = 5  # for each coordinate
@@ -73,7 +72,7 @@ class MaterialGrid:
         """Yield the vademecum at every point, some tenths of a second each."""
         reference = {"young": self.young} if self.coordinates else {}
         for point in self.points():
-            yield at_values(vademecum, reference | point)
+            yield vademecum.at(reference | point)
 
     def softer(self, values: Mapping[str, FloatArray]) -> FloatArray:
         """Return E / E0 at values of "young", shape (n,)."""

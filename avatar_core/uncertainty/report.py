@@ -18,12 +18,10 @@ if TYPE_CHECKING:
 UNITS = {"young": " Pa"}
 
 
-def rows(
-    centers: FloatArray, depths: Sequence[float], bands: Bands
-) -> list[dict[str, float | list[float]]]:
-    """Return one for each place and depth, in SI units."""
+def rows(depths: Sequence[float], bands: Bands) -> list[dict[str, float | list[float]]]:
+    """Return one row for each place and depth, in SI units."""
     found: list[dict[str, float | list[float]]] = []
-    for i, center in enumerate(centers):
+    for i, center in enumerate(bands.places):
         for k, depth in enumerate(depths):
             row: dict[str, float | list[float]] = {"place_m": center.tolist(), "depth_m": depth}
             for name, values in (("force_N", bands.force), ("target_moved_m", bands.moved)):
@@ -35,12 +33,7 @@ def rows(
 
 
 def say(
-    name: str,
-    draws: int,
-    known: Mapping[str, Distribution],
-    centers: FloatArray,
-    depths: Sequence[float],
-    bands: Bands,
+    name: str, draws: int, known: Mapping[str, Distribution], depths: Sequence[float], bands: Bands
 ) -> None:
     """Print what was assumed, and a line for each place and depth."""
     print(f"{name}: {draws} draws")
@@ -50,7 +43,7 @@ def say(
     print(f"  {'':22s}{'':>8s}{'force [N]':>26s}{'target moves [mm]':>27s}  share of the force's")
     ends = f"{'5 %':>8s}{'50 %':>9s}{'95 %':>9s}"
     print(f"  {'place [mm]':22s}{'depth':>8s}{ends} {ends}  {shares}")
-    for i, center in enumerate(centers):
+    for i, center in enumerate(bands.places):
         place = "({:.0f}, {:.0f}, {:.0f})".format(*(1e3 * center))
         for k, depth in enumerate(depths):
             force = "".join(f"{value:9.3g}" for value in bands.force[:, i, k])
@@ -62,12 +55,7 @@ def say(
 
 
 def picture(
-    file: Path,
-    name: str,
-    known: Mapping[str, Distribution],
-    centers: FloatArray,
-    depths: Sequence[float],
-    bands: Bands,
+    file: Path, name: str, known: Mapping[str, Distribution], depths: Sequence[float], bands: Bands
 ) -> None:
     """The bands over depth, and the shares at the largest depth."""
     import matplotlib
@@ -76,7 +64,7 @@ def picture(
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 3, figsize=(14.0, 4.6), layout="constrained")
-    labels = ["({:.0f}, {:.0f}, {:.0f})".format(*(1e3 * center)) for center in centers]
+    labels = ["({:.0f}, {:.0f}, {:.0f})".format(*(1e3 * center)) for center in bands.places]
     _draw_bands(axes[0], depths, bands.force, labels, "force [N]")
     _draw_bands(axes[1], depths, 1e3 * bands.moved, labels, "displacement of the target [mm]")
     _draw_shares(axes[2], bands, labels)

@@ -1,18 +1,19 @@
-"""A vademecum at chosen values of its coordinates (:mod:`avatar_core.vademecum.parametric`)."""
+"""What of a vademecum depends on its coordinates (:mod:`avatar_core.vademecum.parametric`)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from avatar_core.common.supports import SUPPORT
 from avatar_core.errors import CoordinateError
 from avatar_core.fem.elasticity import Material, factors_at
-from avatar_core.fem.resection import opened_to
-from avatar_core.fem.supports import with_stiffness
+from avatar_core.fem.resection import Resection, opened_to
+from avatar_core.fem.supports import Support, with_stiffness
+from avatar_core.reduction.block_field import BlockField
 from avatar_core.reduction.coordinates import (
     RESECTION,
     Coordinate,
@@ -21,64 +22,66 @@ from avatar_core.reduction.coordinates import (
     require_known,
     stiffness_of,
 )
+from avatar_core.reduction.near_field import LocalBlocks
 from avatar_core.reduction.separated import SeparatedField
-from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.modal_mass import BodyResponse
 from avatar_core.vademecum.parametric import (
+    ParametricResponse,
     combined,
     field_at,
     galerkin_field,
-    galerkin_load,
     regional_load_of_basis,
     stiffness_root,
 )
 
 
-def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
-    """The vademecum at chosen values of its coordinates; takes some tenths of a second.
+@dataclass(frozen=True)
+class Valued:
+    """The fields of a vademecum that depend on the values of its coordinates, by the same names."""
 
-    Parameters
-    ----------
-    vademecum : Vademecum
-    values : by name of a coordinate; what is not given keeps its value. "young" [Pa] is a
-        coordinate of every vademecum: displacements are proportional to 1 / E. On supports it is
-        their stiffness over E that they depend on, so that these must be coordinates too.
+    material: Material
+    contrast: float | None
+    supports: tuple[Support, ...]
+    resection: Resection | None
+    far: SeparatedField
+    field: BlockField
+    trailing: np.ndarray
+    contact_near: LocalBlocks
+    body: BodyResponse | None
 
-    Raises
-    ------
-    CoordinateError, MaterialError
-        For a coordinate that is not there, or a value out of range.
-    """
+
+def at_values(
+    here: Valued, parametric: ParametricResponse | None, values: Mapping[str, float]
+) -> Valued:
+    """The fields at chosen values; see :meth:`avatar_core.vademecum.model.Vademecum.at`."""
     given = dict(values)
-    material = replace(
-        vademecum.material, young_modulus=given.pop("young", vademecum.material.young_modulus)
-    )
-    parametric = vademecum.parametric
+    material = replace(here.material, young_modulus=given.pop("young", here.material.young_modulus))
     coordinates = parametric.coordinates if parametric else ()
     require_known(coordinates, given)
-    stiffens = material.young_modulus != vademecum.material.young_modulus
+    stiffens = material.young_modulus != here.material.young_modulus
     if stiffens:
-        _require_free(vademecum, coordinates)
-    if parametric is None or not (given or (stiffens and vademecum.supports)):
-        return _with_young_modulus(vademecum, material)
-    supports = with_stiffness(vademecum.supports, stiffness_of(given))
+        _require_free(here, coordinates)
+    if parametric is None or not (given or (stiffens and here.supports)):
+        return _with_young_modulus(here, material)
+    supports = with_stiffness(here.supports, stiffness_of(given))
     softer = parametric.young_modulus / material.young_modulus
     # u(E, k) = E0 / E u(E0, k E0 / E)
     at_reference = with_stiffness(supports, {s.name: softer * s.stiffness for s in supports})
-    here = {"poisson": material.poisson_ratio, "contrast": vademecum.contrast or 1.0, **given}
-    here |= {SUPPORT + support.name: support.stiffness for support in at_reference}
-    here.setdefault(RESECTION, vademecum.resection.opened if vademecum.resection else 0.0)
-    point = {c.name: float(here[c.name]) for c in coordinates}
+    point = {"poisson": material.poisson_ratio, "contrast": here.contrast or 1.0, **given}
+    point |= {SUPPORT + support.name: support.stiffness for support in at_reference}
+    point.setdefault(RESECTION, here.resection.opened if here.resection else 0.0)
+    point = {c.name: float(point[c.name]) for c in coordinates}
     _require_in_range(coordinates, point, softer)
     weights = node_weights(coordinates, point)
     material = replace(material, poisson_ratio=point.get("poisson", material.poisson_ratio))
-    contrast = point.get("contrast", vademecum.contrast)
+    contrast = point.get("contrast", here.contrast)
     reference = replace(material, young_modulus=parametric.young_modulus)
-    resection = opened_to(vademecum.resection, point.get(RESECTION))
+    resection = opened_to(here.resection, point.get(RESECTION))
     # the tie softens with the organ: it stands for tissue, and u stays proportional to 1 / E
     factors = factors_at(reference, contrast, at_reference, resection)
     root = stiffness_root(parametric, factors)
     far, trailing, body = galerkin_field(parametric, root)
-    field = vademecum.field
+    field = here.field
     regional_load = regional_load_of_basis(
         parametric, parametric.projection, root, trailing, field.region
     )
@@ -86,7 +89,7 @@ def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
     shared = far.load.reshape(len(regional_load), 3, far.rank).astype(np.float32)
     load = np.concatenate([shared, regional_load], axis=2)
     found = replace(
-        vademecum,
+        here,
         material=reference,
         contrast=contrast,
         supports=supports,
@@ -95,63 +98,17 @@ def at_values(vademecum: Vademecum, values: Mapping[str, float]) -> Vademecum:
         trailing=trailing.astype(np.float32),
         body=body,
         field=field_at(field, parametric.core, root, load),
-        contact_near=replace(
-            vademecum.contact_near, block=combined(parametric.contact_near, weights)
-        ),
+        contact_near=replace(here.contact_near, block=combined(parametric.contact_near, weights)),
     )
     return _with_young_modulus(found, material)
 
 
-def own_compliance_at(vademecum: Vademecum, values: Mapping[str, float]) -> np.ndarray:
-    """Contact compliance at each load position of a load there, (n_positions, 3, 3) [m/N].
-
-    As of :func:`at_values` at the Young's modulus for which the coordinates are computed, without
-    what does not belong to it: a small part of the time.
-
-    Parameters
-    ----------
-    values : Mapping[str, float]
-        Values of all coordinates, by name; within their ranges.
-    """
-    parametric, near = vademecum.parametric, vademecum.contact_near
-    own = np.flatnonzero(near.position == near.target)
-    if parametric is None:
-        return own_compliance(vademecum)
-    poisson = values.get("poisson", vademecum.material.poisson_ratio)
-    material = replace(
-        vademecum.material, young_modulus=parametric.young_modulus, poisson_ratio=poisson
-    )
-    supports = with_stiffness(vademecum.supports, stiffness_of(values))
-    resection = opened_to(vademecum.resection, values.get(RESECTION))
-    contrast = values.get("contrast", vademecum.contrast)
-    factors = factors_at(material, contrast, supports, resection)
-    load = galerkin_load(parametric, stiffness_root(parametric, factors))
-    weights = node_weights(parametric.coordinates, values)
-    return _own_compliance(load, combined(parametric.contact_near[:, own], weights))
-
-
-def own_compliance(vademecum: Vademecum) -> np.ndarray:
-    """Return the same of a vademecum at the values that it has, (n_positions, 3, 3) [m/N]."""
-    near = vademecum.contact_near
-    return _own_compliance(vademecum.contact_load, near.block[near.position == near.target])
-
-
-def _own_compliance(load: np.ndarray, block: np.ndarray) -> np.ndarray:
-    """Return Y_j Y_j^T + the near block of j with itself."""
-    rows = load.reshape(len(block), 3, -1)
-    return np.asarray(rows @ rows.swapaxes(1, 2) + block)
-
-
-def ranges(vademecum: Vademecum) -> dict[str, tuple[float, float]]:
-    """Return the lowest and highest value of each coordinate, by name, if no other is changed.
-
-    "young" is among them only where supports limit it.
-    """
-    parametric = vademecum.parametric
+def ranges(here: Valued, parametric: ParametricResponse | None) -> dict[str, tuple[float, float]]:
+    """See :attr:`avatar_core.vademecum.model.Vademecum.ranges`."""
     coordinates = parametric.coordinates if parametric else ()
     out = {c.name: (c.low, c.high) for c in coordinates}
-    young, least, most = vademecum.material.young_modulus, 0.0, math.inf
-    for support in vademecum.supports:
+    young, least, most = here.material.young_modulus, 0.0, math.inf
+    for support in here.supports:
         name = SUPPORT + support.name
         if parametric is None or name not in out:
             least = most = young
@@ -160,15 +117,15 @@ def ranges(vademecum: Vademecum) -> dict[str, tuple[float, float]]:
         out[name] = low, high
         least = max(least, young * support.stiffness / high)
         most = min(most, young * support.stiffness / low)
-    return out | ({"young": (least, most)} if vademecum.supports else {})
+    return out | ({"young": (least, most)} if here.supports else {})
 
 
-def _require_free(vademecum: Vademecum, coordinates: Sequence[Coordinate]) -> None:
+def _require_free(here: Valued, coordinates: Sequence[Coordinate]) -> None:
     """Raise CoordinateError if a fixed support forbids another Young's modulus."""
     names = [c.name for c in coordinates]
-    for support in vademecum.supports:
+    for support in here.supports:
         if SUPPORT + support.name not in names:
-            raise fixed_support(support.name, vademecum.material.young_modulus)
+            raise fixed_support(support.name, here.material.young_modulus)
 
 
 def _require_in_range(
@@ -184,19 +141,19 @@ def _require_in_range(
             )
 
 
-def _with_young_modulus(vademecum: Vademecum, material: Material) -> Vademecum:
+def _with_young_modulus(here: Valued, material: Material) -> Valued:
     """Everything that is a compliance, times E / E'."""
-    softer = vademecum.material.young_modulus / material.young_modulus
+    softer = here.material.young_modulus / material.young_modulus
     if softer == 1.0:
-        return replace(vademecum, material=material)
+        return replace(here, material=material)
     root = np.float32(np.sqrt(softer))
-    far, contact = vademecum.far, vademecum.contact_near
+    far, contact = here.far, here.contact_near
     return replace(
-        vademecum,
+        here,
         material=material,
         far=SeparatedField(root * far.space, root * far.load),
-        body=vademecum.body.mixed(root * np.eye(far.rank)) if vademecum.body else None,
-        field=vademecum.field.softened(softer),
-        trailing=root * vademecum.trailing,
+        body=here.body.mixed(root * np.eye(far.rank)) if here.body else None,
+        field=here.field.softened(softer),
+        trailing=root * here.trailing,
         contact_near=replace(contact, block=np.float32(softer) * contact.block),
     )

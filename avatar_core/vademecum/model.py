@@ -11,7 +11,8 @@ construction, exact at the load positions themselves.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,6 +28,7 @@ from avatar_core.reduction.block_field import BlockField, Blocks
 from avatar_core.reduction.near_field import LocalBlocks
 from avatar_core.reduction.pgd import EnrichmentReport
 from avatar_core.reduction.separated import SeparatedField
+from avatar_core.vademecum.at_values import Valued, at_values, ranges
 from avatar_core.vademecum.certificate import Certificate
 from avatar_core.vademecum.display import Display
 from avatar_core.vademecum.large_deformation import LargeCertificate, LargeDeformation, Push
@@ -154,7 +156,7 @@ class Vademecum:
         symmetric [m/N]
     tip_field : TipField, smooth distance, shape and access that a tool tip feels
     parametric : ParametricResponse or None, the coordinates of the material: all fields above
-        are those of one choice of their values (:func:`avatar_core.vademecum.at_values.at_values`)
+        are those of one choice of their values (:meth:`at`)
     contrast : Young's modulus inside the tumour over that outside; None without a tumour
     supports : springs that hold the organ, beside the clamp of ``regions``
     resection : how far the cut of the mesh is opened; None without a cut
@@ -326,6 +328,38 @@ class Vademecum:
         missed = missed_between(places, here.positions[None], here.weights[None])[0]
         stiffness = self.material.plane_strain_modulus * radius
         return found + missed / stiffness * np.outer(here.normal, here.normal)
+
+    def at(self, values: Mapping[str, float] | None = None, /, **named: float) -> Vademecum:
+        """The same organ at other values of its coordinates; takes some tenths of a second.
+
+        Parameters
+        ----------
+        values : mapping of str to float, optional
+            Values by name of a coordinate, for names with a dot, e.g. ``{"support.dome": 1e6}``.
+        **named : float
+            Values by name, e.g. ``poisson=0.45``. A coordinate that is not given keeps its value.
+            ``young`` [Pa] is a coordinate of every vademecum, since displacements are proportional
+            to 1 / E. Where supports hold the organ, their stiffness must be a coordinate too.
+
+        Raises
+        ------
+        CoordinateError, MaterialError
+            If the vademecum has no such coordinate, or the value lies out of its range.
+        """
+        found = at_values(self._valued, self.parametric, {**(values or {}), **named})
+        return replace(self, **vars(found))
+
+    @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Lowest and highest value of each coordinate, by name, while the others stay.
+
+        "young" is among them only where supports limit it.
+        """
+        return ranges(self._valued, self.parametric)
+
+    @property
+    def _valued(self) -> Valued:
+        return Valued(**{field.name: getattr(self, field.name) for field in fields(Valued)})
 
     def with_certificate(self, certificate: Certificate) -> Vademecum:
         """The same vademecum with a certificate of its errors."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +28,22 @@ def test_names_for_type_checkers_are_the_names_that_exist() -> None:
     (block,) = (node for node in tree.body if isinstance(node, ast.If))
     named = {a.asname or a.name for node in ast.walk(block) for a in getattr(node, "names", ())}
     assert named == set(av.__all__) == {n for n in dir(av) if getattr(av, n, None) and n in named}
+
+
+def test_nothing_heavy_is_imported_before_it_is_asked_for() -> None:
+    code = (
+        "import sys, avatar_core as av; before = set(sys.modules); assert 'effects' in dir(av);"
+        "print(*sorted(m.partition('.')[0] for m in before))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert not {"numpy", "scipy", "numba", "h5py", "skfem", "igl"} & set(done.stdout.split())
+
+
+def test_every_effect_of_a_scene_is_there() -> None:
+    for effect in av.effects.EFFECTS.values():
+        assert getattr(av.effects, effect.__name__) is effect
+    scene = av.Scene(effects=(av.effects.Friction(static=0.2, kinetic=0.1),))
+    assert scene.effect("friction") == av.effects.Friction(0.2, 0.1)
 
 
 @pytest.mark.parametrize("name", av.__all__)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from avatar_core.contact.cloud_kernels import BLOCK
-from avatar_core.contact.effects import EFFECTS, Effect, LargeDeformationEffect
+from avatar_core.contact.effects import EFFECTS, Effect, LargeDeformation
 from avatar_core.contact.effects.base import Ground
 from avatar_core.contact.layout import LANES, MODEL
 from avatar_core.contact.model import ContactData
@@ -82,7 +82,7 @@ def flat_organ(
         effect.name: effect.lay_out(_ground(field, tip, period)) for effect in effects
     }
     if neo_hookean is not None:
-        constants["large_deformation"] = LargeDeformationEffect.Constants(
+        constants["large_deformation"] = LargeDeformation.Constants(
             np.zeros((3, *shape), single), np.zeros((1, 2, 0), single), np.zeros(2, np.int64)
         )
     arrays = MODEL(

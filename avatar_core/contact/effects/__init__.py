@@ -11,7 +11,7 @@ from avatar_core.contact.effects.base import Effect
 from avatar_core.contact.effects.friction import Friction
 from avatar_core.contact.effects.grasp import Grasp
 from avatar_core.contact.effects.inertia import Inertia
-from avatar_core.contact.effects.large_deformation import LargeDeformationEffect
+from avatar_core.contact.effects.large_deformation import LargeDeformation
 from avatar_core.contact.effects.respiration import Respiration
 from avatar_core.contact.effects.self_weight import SelfWeight
 from avatar_core.contact.effects.several_tools import SeveralTools
@@ -22,7 +22,7 @@ from avatar_core.contact.effects.viscoelasticity import Viscoelasticity
 EFFECTS: dict[str, type[Effect]] = {
     effect.name: effect
     for effect in (
-        LargeDeformationEffect,
+        LargeDeformation,
         Friction,
         Viscoelasticity,
         Inertia,
@@ -41,7 +41,7 @@ __all__ = [
     "Friction",
     "Grasp",
     "Inertia",
-    "LargeDeformationEffect",
+    "LargeDeformation",
     "Respiration",
     "SelfWeight",
     "SeveralTools",

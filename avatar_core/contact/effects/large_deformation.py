@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class LargeDeformationEffect(Effect):
+class LargeDeformation(Effect):
     """Large deformation: the response depends nonlinearly on the magnitude of the force."""
 
     name: ClassVar[str] = "large_deformation"

@@ -55,7 +55,4 @@ class Tumour(Effect):
             or not any(low <= contrast <= high for low, high in ranges)
         ):
             return vademecum
-        # Here, because the contact node needs none of it.
-        from avatar_core.vademecum.at_values import at_values
-
-        return at_values(vademecum, {"contrast": contrast})
+        return vademecum.at(contrast=contrast)

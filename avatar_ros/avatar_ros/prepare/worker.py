@@ -110,7 +110,6 @@ class ModelPreparer:
         from avatar_core.contact.layout import MODEL
         from avatar_core.contact.model import ContactModel
         from avatar_core.scene.file import parse_scene
-        from avatar_core.vademecum.at_values import ranges
         from avatar_ros.prepare.scenes import model_spec, usable_material
 
         scene = parse_scene(request.scene, "scene") if request.scene else None
@@ -129,7 +128,7 @@ class ModelPreparer:
                 id=vademecum.id,
                 name=vademecum.name,
                 contents=contents,
-                ranges=ranges(vademecum),
+                ranges=vademecum.ranges,
                 effects=spec.effect_names,
                 cloud_divisor=scene.cloud_divisor if scene else None,
                 curve=spec.curve.plain() if spec.curve else None,

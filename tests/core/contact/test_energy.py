@@ -13,7 +13,7 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from avatar_core.contact.effects import Effect, LargeDeformationEffect, SeveralTools
+from avatar_core.contact.effects import Effect, LargeDeformation, SeveralTools
 from avatar_core.contact.model import ContactData, Status
 from avatar_core.contact.tool_path import inner_positions
 from avatar_core.errors import SceneError
@@ -36,7 +36,7 @@ from tests.helpers.flat_organ import RADIUS as FLAT_RADIUS
 from tests.helpers.tool_motion import AWAY, energy_slope, follow, line, polygon, refined
 
 SPHERE = Tip("sphere", RADIUS)
-LARGE = (LargeDeformationEffect(),)
+LARGE = (LargeDeformation(),)
 FAST = 5e-3  # in a period: 5 m/s [m]
 
 

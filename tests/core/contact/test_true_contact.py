@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from avatar_core.certify.contact_sites import Site, draw_sites
-from avatar_core.contact.effects import LargeDeformationEffect, SeveralTools
+from avatar_core.contact.effects import LargeDeformation, SeveralTools
 from avatar_core.fem.elasticity import Material
 from avatar_core.fem.signorini import CondensedContact, Push
 from avatar_core.fem.sphere_indentation import Domain, SphereIndentation
@@ -107,7 +107,7 @@ def test_a_sphere_feels_the_large_strain_of_a_neo_hookean_cube(radius: float) ->
     problem = hyperelastic_problem(cube, "neo-hookean")
     bent = with_large_deformation(cube, problem, "neo-hookean", rule)
     tip = Tip("sphere", radius)
-    data = prepare(bent, (tip,), cloud="off", effects=(LargeDeformationEffect(),))
+    data = prepare(bent, (tip,), cloud="off", effects=(LargeDeformation(),))
     place = (top("cube")[None], UP[None])
     elements = SphereIndentation(MATERIAL.poisson_ratio, domain=Domain(0.2))
     for each in elements.press([0.25, 0.5, 1.0]):

@@ -36,7 +36,6 @@ from avatar_core.reduction.coordinates import Coordinate, node_values, node_weig
 from avatar_core.scene.file import parse_scene, write_scene
 from avatar_core.scene.model import Scene, SupportStiffness
 from avatar_core.scene.prepare import scene_spec
-from avatar_core.vademecum.at_values import at_values, ranges
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from tests.helpers.contact import prepare, step
@@ -138,7 +137,7 @@ def test_unseen_values_agree_with_full_finite_elements(
 ) -> None:
     rng = np.random.default_rng(100 + k)
     values = {c.name: c.value_at(rng.random()) for c in (POISSON, CONTRAST)}
-    c = certify(at_values(organ, values), problem_at(problem, values), 25, k)
+    c = certify(organ.at(values), problem_at(problem, values), 25, k)
     assert c.l2_mean < 0.05
     assert c.l2_worst < 0.12
     assert c.contact_mean < 0.03
@@ -164,7 +163,7 @@ def test_at_a_node_the_contact_is_exact_at_the_load_positions(
     organ: Vademecum, problem: Elasticity
 ) -> None:
     values = {"poisson": float(POISSON.nodes[1]), "contrast": float(CONTRAST.nodes[2])}
-    v, there = at_values(organ, values), problem_at(problem, values)
+    v, there = organ.at(values), problem_at(problem, values)
     some = np.arange(0, v.surface.n_positions, 9)
     loads = patch_loads(there, v.surface.centers[some], v.surface.patch_radius)
     exact = (loads.T @ there.solve(loads)).reshape(len(some), 3, len(some), 3)
@@ -174,13 +173,13 @@ def test_at_a_node_the_contact_is_exact_at_the_load_positions(
 
 
 def test_young_modulus_divides_every_displacement(organ: Vademecum) -> None:
-    softer = at_values(organ, {"young": organ.material.young_modulus / 2.0})
+    softer = organ.at(young=organ.material.young_modulus / 2.0)
     where = np.array([3]), np.ones(1)
     np.testing.assert_allclose(
         softer.displacement(*where), 2.0 * organ.displacement(*where), rtol=1e-4, atol=1e-10
     )
     np.testing.assert_allclose(softer.compliance(*where), 2.0 * organ.compliance(*where), rtol=1e-4)
-    again = at_values(softer, {"poisson": organ.material.poisson_ratio})
+    again = softer.at(poisson=organ.material.poisson_ratio)
     np.testing.assert_allclose(again.compliance(*where), softer.compliance(*where), rtol=1e-4)
 
 
@@ -188,7 +187,7 @@ def test_contact_stays_positive_definite_between_the_nodes(organ: Vademecum) -> 
     rng = np.random.default_rng(4)
     n = organ.surface.n_positions
     for values in ({"poisson": 0.33, "contrast": 0.8}, {"poisson": 0.478, "contrast": 6.0}):
-        here = at_values(organ, values)
+        here = organ.at(values)
         scale = here.compliance(np.array([0]), np.ones(1)).trace()
         for _ in range(40):
             active = rng.choice(n, 12, replace=False)
@@ -240,7 +239,7 @@ def test_tips_stay_in_contact_when_the_material_changes(organ: Vademecum) -> Non
     for tip in path[:200]:
         step(before, tip[None].copy())
     assert before.out.force.any()
-    after = prepare(at_values(organ, {"young": 0.3e6}), (Tip("sphere", 5e-3),))
+    after = prepare(organ.at(young=0.3e6), (Tip("sphere", 5e-3),))
     after.resume(before)
     step(after, path[200][None].copy())
     assert np.linalg.norm(after.out.force) > np.linalg.norm(before.out.force)
@@ -253,7 +252,7 @@ def test_it_is_read_as_it_was_written(organ: Vademecum, tmp_path: Path) -> None:
     assert read.parametric.coordinates == (POISSON, CONTRAST)
     assert read.contrast == organ.contrast
     values = {"poisson": 0.4, "contrast": 3.0}
-    one, other = at_values(read, values), at_values(organ, values)
+    one, other = read.at(values), organ.at(values)
     np.testing.assert_allclose(
         one.far.load @ one.far.load.T,
         other.far.load @ other.far.load.T,
@@ -279,7 +278,7 @@ def test_a_value_out_of_range_is_refused(
     organ: Vademecum, values: dict[str, float], error: type[Exception], reason: str
 ) -> None:
     with pytest.raises(error, match=reason):
-        at_values(organ, values)
+        organ.at(values)
 
 
 def test_a_contrast_needs_a_tumour() -> None:
@@ -366,8 +365,8 @@ def test_the_organ_begins_at_the_typical_stiffness_and_says_so(springs: Vademecu
     (support,) = springs.supports
     assert (support.name, support.stiffness) == ("bare_area", 1e6)
     assert not springs.regions.clamped.any()
-    assert ranges(springs)[BARE] == (1e5, 1e9)
-    low, high = ranges(springs)["young"]
+    assert springs.ranges[BARE] == (1e5, 1e9)
+    low, high = springs.ranges["young"]
     assert low == pytest.approx(YOUNG * 1e6 / 1e9)
     assert high == pytest.approx(YOUNG * 1e6 / 1e5)
 
@@ -377,7 +376,7 @@ def test_at_its_nodes_it_is_as_exact_as_one_without_coordinates(
     springs: Vademecum, held: Elasticity, stiffness: float
 ) -> None:
     values = {BARE: stiffness}
-    found = misses(at_values(springs, values), problem_at(held, values), some_positions(springs))
+    found = misses(springs.at(values), problem_at(held, values), some_positions(springs))
     assert found.mean() < 0.03
 
 
@@ -387,12 +386,10 @@ def test_between_its_nodes_it_answers_by_full_finite_elements(
     found = []
     for stiffness in (3e5, 2e6, 3e7, 3e8):
         values = {BARE: stiffness}
-        found.append(
-            misses(at_values(springs, values), problem_at(held, values), some_positions(springs))
-        )
+        found.append(misses(springs.at(values), problem_at(held, values), some_positions(springs)))
     assert np.mean(found) < 0.08  # three nodes over four decades
     # another stiffness of this size is another answer altogether
-    wrong = misses(at_values(springs, {BARE: 3e5}), problem_at(held, {BARE: 3e6}), np.array([3]))
+    wrong = misses(springs.at({BARE: 3e5}), problem_at(held, {BARE: 3e6}), np.array([3]))
     assert wrong.min() > 0.5
 
 
@@ -400,38 +397,38 @@ def test_with_another_modulus_the_springs_keep_their_stiffness(
     springs: Vademecum, held: Elasticity
 ) -> None:
     values = {"young": 0.34e6, BARE: 2e7}  # the springs are those of the node 1e7 at 0.17e6
-    here = at_values(springs, values)
+    here = springs.at(values)
     assert here.material.young_modulus == 0.34e6
     assert here.supports[0].stiffness == 2e7
     exact = held.at(replace(held.material, young_modulus=0.34e6), None, {"bare_area": 2e7})
     assert misses(here, exact, some_positions(springs)).mean() < 0.03
     # and the same by two steps, and back
-    twice = at_values(at_values(springs, {BARE: 2e7}), {"young": 0.34e6})
+    twice = springs.at({BARE: 2e7}).at(young=0.34e6)
     np.testing.assert_allclose(twice.far.load, here.far.load, rtol=1e-4, atol=1e-6)
-    back = at_values(twice, {"young": YOUNG, BARE: 1e6})
+    back = twice.at({"young": YOUNG, BARE: 1e6})
     np.testing.assert_allclose(back.far.load, springs.far.load, rtol=1e-3, atol=1e-5)
 
 
 def test_a_stiffness_out_of_range_is_refused_with_the_range(springs: Vademecum) -> None:
     with pytest.raises(CoordinateError, match=r"holds 100000 to 1e\+09"):
-        at_values(springs, {BARE: 1e10})
+        springs.at({BARE: 1e10})
     # at a tenth of the modulus, springs of 1e9 are as those of 1e10 are here
     with pytest.raises(CoordinateError, match=r"at this Young's modulus .* 10000 to 1e\+08"):
-        at_values(springs, {BARE: 1e9, "young": 0.017e6})
+        springs.at({BARE: 1e9, "young": 0.017e6})
     with pytest.raises(CoordinateError, match="--support falciform=LOW:HIGH"):
-        at_values(springs, {SUPPORT + "falciform": 1e5})
+        springs.at({SUPPORT + "falciform": 1e5})
 
 
 def test_a_fixed_support_fixes_young_s_modulus(springs: Vademecum) -> None:
     other = Support("falciform", springs.supports[0].faces, 1e5)
     fixed = replace(springs, supports=(*springs.supports, other))
     with pytest.raises(CoordinateError, match="support falciform is fixed"):
-        at_values(fixed, {"young": 0.1e6})
-    assert ranges(fixed)["young"] == (YOUNG, YOUNG)
+        fixed.at(young=0.1e6)
+    assert fixed.ranges["young"] == (YOUNG, YOUNG)
 
 
 def test_a_file_keeps_supports_and_their_coordinate(springs: Vademecum, tmp_path: Path) -> None:
-    save_vademecum(at_values(springs, {BARE: 4e6}), tmp_path / "springs.h5")
+    save_vademecum(springs.at({BARE: 4e6}), tmp_path / "springs.h5")
     read = load_vademecum(tmp_path / "springs.h5")
     (support,) = read.supports
     assert (support.name, support.stiffness) == ("bare_area", 4e6)
@@ -440,8 +437,7 @@ def test_a_file_keeps_supports_and_their_coordinate(springs: Vademecum, tmp_path
     assert read.parametric.coordinates == (Coordinate(BARE, 1e5, 1e9, 3),)
     where = (np.array([1]), np.ones(1))
     np.testing.assert_array_equal(
-        at_values(read, {BARE: 1e8}).compliance(*where),
-        at_values(springs, {BARE: 1e8}).compliance(*where),
+        read.at({BARE: 1e8}).compliance(*where), springs.at({BARE: 1e8}).compliance(*where)
     )
 
 

@@ -31,7 +31,6 @@ from avatar_core.geometry.tip import Tip
 from avatar_core.offline.large_deformation import LargeRule, economised, hyperelastic_problem
 from avatar_core.pipeline import OrganOptions
 from avatar_core.reduction.asymptotic_series import path_series
-from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.large_deformation import LargeCertificate, hyperelastic, powers
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
@@ -127,7 +126,7 @@ def test_a_small_push_is_the_linear_one(bent: Vademecum) -> None:
 
 def test_a_stiffer_organ_takes_more_force_for_the_same_shape(bent: Vademecum) -> None:
     here = np.array([middle_of_access(bent)]), np.ones(1)
-    stiff = at_values(bent, {"young": 3.0 * bent.material.young_modulus})
+    stiff = bent.at(young=3.0 * bent.material.young_modulus)
     force, found = bent.push_to(*here, 12e-3)
     three, same = stiff.push_to(*here, 12e-3)
     assert three == pytest.approx(3.0 * force, rel=1e-4)

@@ -22,7 +22,6 @@ from avatar_core.reduction.coordinates import Coordinate, problem_at
 from avatar_core.scene.file import parse_scene, write_scene
 from avatar_core.scene.model import Scene
 from avatar_core.scene.prepare import scene_spec
-from avatar_core.vademecum.at_values import at_values, ranges
 from avatar_core.vademecum.modal_mass import sag_of
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.resected import margins, part_volumes
@@ -62,7 +61,7 @@ def test_it_begins_whole_with_six_values(organ: Vademecum) -> None:
     np.testing.assert_allclose(OPENED.nodes, np.linspace(0.0, 1.0, 6))
     assert organ.resection is not None
     assert organ.resection.opened == 0.0
-    assert ranges(organ) == {"resection": (0.0, 1.0)}
+    assert organ.ranges == {"resection": (0.0, 1.0)}
 
 
 @pytest.mark.parametrize("opened", [0.0, 0.1, 0.35, 0.5, 0.9, 1.0])
@@ -70,13 +69,13 @@ def test_at_any_opening_it_answers_by_full_finite_elements(
     organ: Vademecum, problem: Elasticity, opened: float
 ) -> None:
     values = {"resection": opened}
-    found = misses(at_values(organ, values), problem_at(problem, values))
+    found = misses(organ.at(values), problem_at(problem, values))
     assert found.mean() < 0.03
     assert found.max() < 0.08
 
 
 def test_another_opening_is_another_answer(organ: Vademecum, problem: Elasticity) -> None:
-    wrong = misses(at_values(organ, {"resection": 0.2}), problem_at(problem, {"resection": 0.9}))
+    wrong = misses(organ.at(resection=0.2), problem_at(problem, {"resection": 0.9}))
     assert wrong.mean() > 0.2
 
 
@@ -85,7 +84,7 @@ def test_the_organ_sags_as_far_as_it_is_opened(
     organ: Vademecum, problem: Elasticity, opened: float
 ) -> None:
     values = {"resection": opened}
-    here, there = at_values(organ, values), problem_at(problem, values)
+    here, there = organ.at(values), problem_at(problem, values)
     assert here.body is not None
     exact = there.at_vertices(sag_of(there)[1])
     found = here.far.space.astype(float) @ here.body.weight
@@ -94,8 +93,8 @@ def test_the_organ_sags_as_far_as_it_is_opened(
 
 def test_young_modulus_divides_every_displacement_of_an_opened_organ(organ: Vademecum) -> None:
     young, where = organ.material.young_modulus, (np.array([3]), np.ones(1))
-    stiff = at_values(organ, {"resection": 0.5})
-    soft = at_values(organ, {"resection": 0.5, "young": young / 2.0})
+    stiff = organ.at(resection=0.5)
+    soft = organ.at(resection=0.5, young=young / 2.0)
     np.testing.assert_allclose(soft.compliance(*where), 2.0 * stiff.compliance(*where), rtol=1e-4)
 
 
@@ -118,7 +117,7 @@ def test_a_scene_chooses_the_opening(organ: Vademecum) -> None:
 @pytest.mark.parametrize("opened", [-0.1, 1.1, float("nan")])
 def test_an_opening_out_of_range_is_refused(organ: Vademecum, opened: float) -> None:
     with pytest.raises(CoordinateError, match="holds 0 to 1"):
-        at_values(organ, {"resection": opened})
+        organ.at(resection=opened)
 
 
 def test_a_resection_needs_its_surface() -> None:
@@ -127,15 +126,14 @@ def test_a_resection_needs_its_surface() -> None:
 
 
 def test_it_is_read_as_it_was_written(organ: Vademecum, tmp_path: Path) -> None:
-    save_vademecum(at_values(organ, {"resection": 0.4}), tmp_path / "cut.h5")
+    save_vademecum(organ.at(resection=0.4), tmp_path / "cut.h5")
     read = load_vademecum(tmp_path / "cut.h5")
     assert organ.resection is not None
     assert read.resection == replace(organ.resection, opened=0.4)
     np.testing.assert_array_equal(read.mesh.cut_faces, organ.mesh.cut_faces)
     where = (np.array([1]), np.ones(1))
     np.testing.assert_array_equal(
-        at_values(read, {"resection": 0.7}).compliance(*where),
-        at_values(organ, {"resection": 0.7}).compliance(*where),
+        read.at(resection=0.7).compliance(*where), organ.at(resection=0.7).compliance(*where)
     )
 
 

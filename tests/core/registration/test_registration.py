@@ -23,7 +23,7 @@ from avatar_core.registration.cloud import Cloud, read_cloud, require_on_organ
 from avatar_core.registration.fit import Problem, RegistrationRule, rigid_motion
 from avatar_core.registration.loads import smooth_loads
 from avatar_core.registration.posterior import Scales, averaged, cells_of, equations, posterior
-from avatar_core.registration.register import register, target_at, targets
+from avatar_core.registration.register import register
 from avatar_core.registration.rigid import RigidMotion
 from avatar_core.studies.registration import measured
 from avatar_core.studies.registration_others import POINT, answers, on_small_clamp
@@ -113,7 +113,7 @@ def test_the_organ_is_found_from_a_part_of_its_surface(
 def test_the_standard_deviation_grows_away_from_what_is_seen(
     phantom_vademecum: Vademecum, case: Case
 ) -> None:
-    found = register(phantom_vademecum, case.cloud, RegistrationRule(kind="smooth"))
+    found = register(phantom_vademecum, case.cloud.points, RegistrationRule(kind="smooth"))
     seen = np.linalg.norm(found.place[:, None] - case.cloud.points[None, ::10], axis=2).min(axis=1)
     deviation = np.linalg.norm(found.place_deviation, axis=1)
     assert deviation[seen > 0.07].mean() > 1.5 * deviation[seen < 0.01].mean()
@@ -261,13 +261,13 @@ def test_targets_are_estimated_with_their_own_deviation(
     ball = display_ball(phantom_vademecum)
     v = replace(phantom_vademecum, display=ball)
     found = register(v, case.cloud)
-    (tumour,) = targets(v, found)
+    (tumour,) = found.targets()
     assert tumour.name == "lesion"
-    point = target_at(v, found, tumour.rest)
+    point = found.target_at(tumour.rest.tolist())
     np.testing.assert_allclose(point.place, tumour.place, atol=1e-3)
     np.testing.assert_allclose(point.place_deviation, tumour.place_deviation, rtol=0.3)
     with pytest.raises(RegistrationError, match="outside the organ"):
-        target_at(v, found, np.array([0.0, 0.5, 0.0]))
+        found.target_at(np.array([0.0, 0.5, 0.0]))
 
 
 def display_ball(v: Vademecum) -> object:
@@ -417,7 +417,7 @@ def test_the_command_writes_the_surface_with_its_deviation(
     mesh = meshio.read(tmp_path / "out.vtu")
     found = register(v, read_cloud(tmp_path / "c.xyz"))
     np.testing.assert_allclose(mesh.points, found.place, atol=1e-9)
-    np.testing.assert_allclose(document["targets"][0]["place"], targets(v, found)[0].place)
+    np.testing.assert_allclose(document["targets"][0]["place"], found.targets()[0].place)
     assert document["explained"] and len(document["forces"]) >= 1
     assert run(monkeypatch, *given, "-o", tmp_path / "out.vtu", "--noise", "1") == 1
     assert capsys.readouterr().err.count("\n") == 1

@@ -11,7 +11,7 @@ from avatar_core.contact.effects import (
     Effect,
     Friction,
     Inertia,
-    LargeDeformationEffect,
+    LargeDeformation,
     Respiration,
     SelfWeight,
     SeveralTools,
@@ -142,7 +142,7 @@ def test_poissons_ratio_has_to_be_a_coordinate() -> None:
 
 def test_every_effect_is_asked_what_it_needs() -> None:
     with pytest.raises(SceneError, match="--material neo-hookean"):
-        Scene(effects=(Friction(), LargeDeformationEffect())).require(organ())
+        Scene(effects=(Friction(), LargeDeformation())).require(organ())
     with pytest.raises(SceneError, match="--tumour FILE"):
         Scene(effects=(Friction(), Tumour())).require(organ())
     for heavy in (Inertia(), SelfWeight()):
@@ -181,7 +181,7 @@ PARTNERS: list[tuple[Effect, str | None]] = [
 
 def large_scene(partner: Effect) -> Scene:
     tools = TWO if partner == SeveralTools() else (Tool(),)
-    return Scene(tools=tools, effects=(partner, LargeDeformationEffect()))
+    return Scene(tools=tools, effects=(partner, LargeDeformation()))
 
 
 @pytest.mark.parametrize(("partner", "figure"), PARTNERS)
@@ -206,7 +206,7 @@ def test_a_combination_that_is_too_wrong_is_refused_with_its_figure(
 
 
 def test_what_was_not_measured_is_said_and_not_refused() -> None:
-    scene = Scene(effects=(Friction(), LargeDeformationEffect()))
+    scene = Scene(effects=(Friction(), LargeDeformation()))
     for unmeasured in (
         large_organ(oblique_contact_mean=float("nan")),
         heavy_organ(large=SimpleNamespace(certificate=None)),
@@ -219,17 +219,17 @@ def test_what_was_not_measured_is_said_and_not_refused() -> None:
 def test_effects_that_superpose_are_no_combination() -> None:
     linear = Scene(effects=(Friction(), PRONY, Inertia(), SelfWeight()))
     assert combinations(linear, organ()) == ()
-    moved = Scene(effects=(LargeDeformationEffect(), Respiration()))
+    moved = Scene(effects=(LargeDeformation(), Respiration()))
     assert combinations(moved, large_organ()) == ()
 
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_effects_that_cannot_run_together_are_refused_with_the_reason(turned: bool) -> None:
-    pair = (Tumour(), LargeDeformationEffect())
+    pair = (Tumour(), LargeDeformation())
     with pytest.raises(SceneError, match=r"large_deformation and tumour exclude .* one material"):
         Scene(effects=pair[::-1] if turned else pair)
 
 
 def test_one_tool_does_not_pay_for_the_coupling_of_two() -> None:
-    scene = Scene(effects=(SeveralTools(), LargeDeformationEffect()))
+    scene = Scene(effects=(SeveralTools(), LargeDeformation()))
     scene.require(large_organ(two_tools_contact_mean=0.9))

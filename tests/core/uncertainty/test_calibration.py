@@ -17,8 +17,9 @@ from avatar_core.uncertainty import material_grid
 from avatar_core.uncertainty.calibration import (
     LEAST_PROBABILITY,
     Calibration,
-    Errors,
+    TouchErrors,
     TouchTable,
+    calibrate,
     calibrated,
     touch_table,
 )
@@ -32,7 +33,6 @@ from avatar_core.uncertainty.distributions import (
 from avatar_core.uncertainty.fit_check import chance, local_chance, normal_scores
 from avatar_core.uncertainty.known import YOUNG, priors_of
 from avatar_core.uncertainty.palpation import N_SAMPLES, palpation_of
-from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
 from tests.core.conftest import Command
@@ -43,7 +43,7 @@ pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that
 
 N_TOUCHES = 8
 TRUE = {"young": 6e3, "poisson": 0.45, "contrast": 5.0}
-SENSOR_ALONE = Errors(sensor=0.02, least=1e-9, depth=0.0, mesh=1e-9, extent=0.0)
+SENSOR_ALONE = TouchErrors(sensor=0.02, least=1e-9, depth=0.0, mesh=1e-9, extent=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def tips(organ: Vademecum) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def forces(organ: Vademecum, tips: np.ndarray) -> np.ndarray:
-    return felt(at_values(organ, TRUE), tips)
+    return felt(organ.at(TRUE), tips)
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +165,7 @@ def test_all_values_are_found_again(organ: Vademecum, table: TouchTable) -> None
 def test_intervals_hold_the_truth_as_often_as_they_say(table: TouchTable) -> None:
     """Errors drawn from C itself; a right model is rarely called wrong."""
     known = {"young": Lognormal(5e3, 1.5), "poisson": Fixed(0.45), "contrast": LogUniform(1, 9.9)}
-    errors, rng = Errors(extent=0.0), np.random.default_rng(2)  # which is not in C
+    errors, rng = TouchErrors(extent=0.0), np.random.default_rng(2)  # which is not in C
     held, chances = [], []
     for _ in range(60):
         true = {name: float(one.ppf(rng.random())) for name, one in known.items()}
@@ -201,12 +201,12 @@ def test_the_extent_of_a_tumour_is_known_no_better_than_its_mesh(
 
 
 def test_larger_errors_widen_the_interval_of_young(organ: Vademecum, table: TouchTable) -> None:
-    def width(errors: Errors) -> float:
+    def width(errors: TouchErrors) -> float:
         low, high = calibrated(table, priors_of(organ), errors).interval("young")
         return np.log(high / low)
 
-    usual = width(Errors())
-    for worse in (Errors(sensor=0.2), Errors(depth=1e-3), Errors(mesh=0.1)):
+    usual = width(TouchErrors())
+    for worse in (TouchErrors(sensor=0.2), TouchErrors(depth=1e-3), TouchErrors(mesh=0.1)):
         assert width(worse) > 1.05 * usual
 
 
@@ -236,6 +236,18 @@ def test_a_posterior_becomes_what_is_known(organ: Vademecum, table: TouchTable) 
     one = found.posterior("young")
     assert one.ppf(np.array(0.5)) == pytest.approx(found.value("young"))
     assert one.ppf(np.array(0.8413)) == pytest.approx(found.value("young", 1.0), rel=0.02)
+
+
+def test_one_call_goes_from_arrays_to_the_posterior(
+    organ: Vademecum, tips: np.ndarray, forces: np.ndarray, table: TouchTable
+) -> None:
+    wanted = calibrated(table, priors_of(organ))
+    for measured in (forces, np.linalg.norm(forces, axis=1)):
+        found = calibrate(organ, tips.tolist(), measured, SPHERE)
+        assert found.names == wanted.names
+        np.testing.assert_array_equal(found.mean, wanted.mean)
+    fixed = calibrate(organ, tips, forces, SPHERE, {"poisson": Fixed(0.45)}, SENSOR_ALONE)
+    assert fixed.names == ("young", "contrast")
 
 
 # --- the command -------------------------------------------------------------------------------

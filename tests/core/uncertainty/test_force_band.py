@@ -24,8 +24,8 @@ from avatar_core.uncertainty.force_table import ForceTable
 from avatar_core.uncertainty.known import Held, known_of
 from avatar_core.uncertainty.material_grid import MaterialGrid
 from avatar_core.vademecum.accuracy import Detail
-from avatar_core.vademecum.at_values import at_values, own_compliance, own_compliance_at
 from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.own_compliance import own_compliance, own_compliance_at
 from tests.helpers import box_organ
 from tests.helpers.box_organ import UP, top
 from tests.helpers.contact import data_of, prepare, step
@@ -94,7 +94,7 @@ def pressed_bands(
             ]
         )
     logs = np.log(force)
-    table = ForceTable(grid, logs, np.zeros_like(logs))
+    table = ForceTable(grid, np.zeros((logs.shape[1], 3)), logs, np.zeros_like(logs))
     return bands_of(table, known).force[[0, 2]]
 
 
@@ -108,7 +108,7 @@ def test_edges_are_those_of_tips_pressed_anywhere(organ: Vademecum, tip: Tip) ->
     """Amid the load positions, at depths between and at those prepared; goal: 3 % of the force."""
     known, (points, normals) = known_of(organ, KNOWN), spots(organ, 6)
     truth = pressed_bands(organ, tip, points, normals, known)
-    here = at_values(organ, {"young": 20e3, "poisson": 0.4, "contrast": 6.0})
+    here = organ.at(young=20e3, poisson=0.4, contrast=6.0)
     data = model_of(here, tip)
     band = band_of(here, data, known, tip)
     found = np.empty_like(truth)
@@ -124,7 +124,7 @@ def test_edges_are_those_of_tips_pressed_anywhere(organ: Vademecum, tip: Tip) ->
 def test_a_tip_over_a_tumour_feels_its_modulus(organ: Vademecum) -> None:
     """Half of the energy under each tip is the tumour's, six times as stiff as the organ; or none
     of it: what that makes of the force, in a step and as it is prepared."""
-    field, soft = organ.tip_field, at_values(organ, {"contrast": 6.0})
+    field, soft = organ.tip_field, organ.at(contrast=6.0)
     points, normals = organ.surface.centers, organ.surface.normals
     places, found, prepared = inner_positions(organ)[::60], [], []
     for part in (0.5, 0.0):
@@ -156,7 +156,7 @@ def test_the_band_stays_where_it_is_while_the_material_changes(organ: Vademecum)
     point, normal = organ.surface.centers[place], organ.surface.normals[place]
     bands, forces = [], []
     for values in ({"poisson": 0.33}, {"poisson": 0.47, "contrast": 8.0}, {"young": 50e3}):
-        here = at_values(organ, values)
+        here = organ.at(values)
         data = model_of(here, SPHERE)
         band = band_of(here, data, known_of(here, KNOWN), SPHERE)
         forces.append(press(data, SPHERE, point, normal, 3e-3))
@@ -187,10 +187,10 @@ def test_compliances_are_those_of_the_vademecum_at_these_values(organ: Vademecum
     assert organ.parametric is not None
     young = organ.parametric.young_modulus
     for values in ({"poisson": 0.31, "contrast": 0.6}, {"poisson": 0.45, "contrast": 4.0}):
-        whole = own_compliance(at_values(organ, values | {"young": young}))
+        whole = own_compliance(organ.at(values | {"young": young}))
         np.testing.assert_allclose(own_compliance_at(organ, values), whole, rtol=1e-4, atol=1e-9)
         j = np.array([5])
-        direct = at_values(organ, values | {"young": young}).compliance(j, np.ones(1))
+        direct = organ.at(values | {"young": young}).compliance(j, np.ones(1))
         np.testing.assert_allclose(whole[5], direct, rtol=1e-5, atol=1e-10)
 
 
@@ -272,7 +272,7 @@ def test_without_prepared_arrays_there_is_no_band(phantom_vademecum: Vademecum) 
 
 
 def test_what_a_vademecum_holds_is_sent_and_judges_alike(organ: Vademecum) -> None:
-    here = at_values(organ, {"poisson": 0.4})
+    here = organ.at(poisson=0.4)
     held = Held.of_plain(Held.by(here).plain())
     assert held == Held.by(here)
     assert held.known(KNOWN) == known_of(here, KNOWN)

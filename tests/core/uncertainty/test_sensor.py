@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from avatar_core.errors import StorageError
-from avatar_core.uncertainty.calibration import MOST_RMS, Errors, calibrated, touch_table
+from avatar_core.uncertainty.calibration import MOST_RMS, TouchErrors, calibrated, touch_table
 from avatar_core.uncertainty.known import priors_of
 from avatar_core.uncertainty.palpation import palpation_of
 from avatar_core.uncertainty.sensor import sensed
-from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 from tests.helpers.soft_organ import soft_organ
 from tests.helpers.touches import SPHERE, felt, path_over
@@ -44,7 +43,7 @@ def organ() -> Vademecum:
 @pytest.fixture(scope="module")
 def path(organ: Vademecum) -> Path:
     tip = np.repeat(path_over(organ, 8), 1, axis=0)
-    force = felt(at_values(organ, TRUE), tip)
+    force = felt(organ.at(TRUE), tip)
     noise = 0.005 * np.random.default_rng(0).standard_normal(force.shape)
     return Path(STEP * np.arange(len(tip)), tip, force + noise)
 
@@ -101,7 +100,7 @@ def test_forces_far_off_are_no_good_fit_whatever_the_stated_errors(
     noise = np.random.default_rng(1).choice([-1.0, 1.0], len(path.tip))
     force = table.palpation.force
     far = table.palpation.force * np.exp(0.3 * noise[: len(force)])
-    for errors in (Errors(), Errors(sensor=0.9, depth=5e-3)):
+    for errors in (TouchErrors(), TouchErrors(sensor=0.9, depth=5e-3)):
         good = calibrated(table, priors_of(organ), errors)
         assert good.explained and good.rms < 0.1
         spoilt = replace(table, palpation=replace(table.palpation, force=far))

@@ -11,14 +11,14 @@ import pytest
 
 from avatar_core.contact.model import model_of
 from avatar_core.contact.tool_path import starts_apart
-from avatar_core.errors import ContactError, CoordinateError
+from avatar_core.errors import ContactError, CoordinateError, LoadError
 from avatar_core.fem.elasticity import Elasticity, Inclusion, Material
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.tip import Tip
 from avatar_core.geometry.tumour import volume_fraction_inside
 from avatar_core.reduction.coordinates import problem_at
 from avatar_core.uncertainty import material_grid
-from avatar_core.uncertainty.bands import Bands, bands_of, drawn
+from avatar_core.uncertainty.bands import Bands, bands_of, drawn, force_bands
 from avatar_core.uncertainty.distributions import (
     Distribution,
     Fixed,
@@ -33,7 +33,6 @@ from avatar_core.uncertainty.distributions import (
 )
 from avatar_core.uncertainty.force_table import ForceTable, _pressed, force_table
 from avatar_core.uncertainty.known import known_of
-from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
 from tests.core.conftest import Command
@@ -208,6 +207,21 @@ def bands(table: ForceTable, organ: Vademecum) -> Bands:
     return bands_of(table, known_of(organ, KNOWN), 1000)
 
 
+def test_one_call_goes_from_points_to_bands(organ: Vademecum, place: int, bands: Bands) -> None:
+    point = organ.surface.centers[place]
+    aim = organ.mesh.vertices[100]
+    found = force_bands(organ, KNOWN, [point + 1e-4], DEPTHS, PATCH, aim)
+    np.testing.assert_array_equal(found.places, [point])
+    np.testing.assert_array_equal(found.force, bands.force)
+    np.testing.assert_array_equal(found.moved, bands.moved)
+    with pytest.raises(LoadError, match="off the accessible surface"):
+        force_bands(organ, KNOWN, [[0.0, 1.0, 0.0]], DEPTHS)
+    with pytest.raises(ContactError, match="give rising numbers above 0, up to"):
+        force_bands(organ, KNOWN, [point], [3e-3, 1e-3])
+    with pytest.raises(ContactError, match=r"target .* outside of the organ"):
+        force_bands(organ, KNOWN, [point], DEPTHS, target=[0.0, 1.0, 0.0])
+
+
 def values_of(known: dict[str, Distribution], n: int) -> dict[str, np.ndarray]:
     return drawn(known, n, seed=5)
 
@@ -225,7 +239,7 @@ def test_between_its_points_a_table_gives_the_force_of_the_vademecum(
     found = table.force(values)[:, 0, -1]
     for k in range(4):
         point = {name: float(column[k]) for name, column in values.items()}
-        own = forces_of(at_values(organ, point), [place])
+        own = forces_of(organ.at(point), [place])
         assert found[k] == pytest.approx(own[0, -1], rel=5e-3)
 
 
@@ -255,7 +269,7 @@ def test_supports_count_over_young() -> None:
     places = starts_apart(organ, 1)
     table = force_table(organ, PATCH, places, DEPTHS, target=0)
     values = {"young": 60e3, "support.bare_area": 5e5}
-    own = forces_of(at_values(organ, values), places)
+    own = forces_of(organ.at(values), places)
     found = table.force({name: np.array([value]) for name, value in values.items()})
     np.testing.assert_allclose(found[0], own, rtol=4e-2)  # a vademecum has kinks at its nodes
     twice = table.force({name: np.array([2.0 * value]) for name, value in values.items()})

@@ -14,7 +14,6 @@ from avatar_ros.bench.footprint import children
 
 from avatar_core.common.child import computed_by
 from avatar_core.scene.recording import load_recording, save_recording
-from avatar_core.vademecum.at_values import at_values
 from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.srv import CalibrateMaterial, LoadVademecum
 from tests.helpers.processes import has_ended
@@ -36,7 +35,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, organ = tmp_path_factory.mktemp("library"), organ_on_springs()
     save_vademecum(organ, folder / "springs.h5")
     tips = path_over(organ, N_TOUCHES)
-    forces = felt(at_values(organ, TRUE), tips)
+    forces = felt(organ.at(TRUE), tips)
     save_recording(recording_of(organ, tips, forces), folder / "push.h5")
     again = (np.tile(one, (400, 1)) for one in (tips, forces))
     save_recording(recording_of(organ, *again), folder / "many_times.h5")

@@ -30,7 +30,6 @@ from avatar_core.uncertainty import force_ratios
 from avatar_core.uncertainty.distributions import Fixed, Lognormal, Uniform, mappings
 from avatar_core.uncertainty.force_ratios import DEPTHS
 from avatar_core.uncertainty.known import Held
-from avatar_core.vademecum.at_values import at_values
 from tests.helpers.contact import prepare
 from tests.helpers.soft_organ import soft_organ
 from tests.ros.helpers.refusals import refusal
@@ -134,7 +133,7 @@ def test_the_band_stays_while_the_force_moves_to_another_material(
 ) -> None:
     """Twice the modulus in use, half the ratios: the force grows within a blend, the band stays."""
     force, band = banded.step()
-    stiff = at_values(organ, {"young": 2.0 * organ.material.young_modulus})
+    stiff = organ.at(young=2.0 * organ.material.young_modulus)
     banded.use(stiff, "a", low=LOW / 2.0, high=HIGH / 2.0)
     for _ in range(N_BLEND // 2):
         half, now = banded.step()

@@ -17,7 +17,6 @@ from avatar_core.common.supports import ATTACHMENTS
 from avatar_core.scene.file import parse_scene, write_scene
 from avatar_core.scene.model import SupportStiffness, Tool
 from avatar_core.scene.prepare import scene_spec
-from avatar_core.vademecum.at_values import ranges
 from avatar_core.vademecum.model import Vademecum
 from tests.core.offline.test_coordinates import BARE, YOUNG
 from tests.helpers.soft_organ import organ_on_springs
@@ -119,6 +118,6 @@ def test_a_recording_keeps_the_stiffness_in_its_scene(organ: Vademecum) -> None:
 def test_a_value_that_the_vademecum_does_not_hold_is_refused(
     organ: Vademecum, name: str, value: float, material: dict[str, float], reason: str
 ) -> None:
-    node = SimpleNamespace(_ranges=ranges(organ))
+    node = SimpleNamespace(_ranges=organ.ranges)
     said = ContactNode._refusal_of(node, name, value, material)  # type: ignore[arg-type]
     assert said == reason if reason == "" else reason in said

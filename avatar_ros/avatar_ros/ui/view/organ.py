@@ -13,7 +13,6 @@ from avatar_core.common.supports import SUPPORT
 from avatar_core.contact.tool_path import middle_of_access, starts_apart
 from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.coordinates import RESECTION
-from avatar_core.vademecum.at_values import ranges
 from avatar_core.vademecum.model import Vademecum, VademecumInfo
 from avatar_core.vademecum.resected import margins, part_volumes
 from avatar_ros.loop.settings import MATERIAL
@@ -59,7 +58,7 @@ class Organ:
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         j = middle_of_access(v)
         young = v.material.young_modulus
-        held = ranges(v)
+        held = v.ranges
         here = {"young": young, "poisson": v.material.poisson_ratio, "contrast": v.contrast or 1.0}
         here |= {SUPPORT + support.name: support.stiffness for support in v.supports}
         here |= {RESECTION: v.resection.opened} if v.resection else {}
