@@ -20,7 +20,7 @@ from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.correspondence import interpolation_matrix
-from avatar_core.shapes.lle import CLEAR_GAP, embed, estimate_dimension, fit
+from avatar_core.shapes.lle import CLEAR_GAP, LLE
 from avatar_core.studies.response import carried, relative_errors, trilinear, unit_load_response
 from avatar_core.studies.shapes import PAPER_GRID, as_grid, distance_vectors, paper_box
 from avatar_core.studies.study import Row, Run, Study, column, follow, mean_and_worst, where
@@ -86,9 +86,9 @@ class InSilicoStudy(Study[InSilicoSettings]):
         spectra = [spectrum_row(livers.vectors, k, r) for k, r in SPECTRA if k < n]
         for row in (*held_out_rows(livers, run.settings), *spectra):
             run.add(row)
-        base = fit(livers.vectors, NEIGHBORS)
-        run.kept["eigenvalues"] = estimate_dimension(base).eigenvalues
-        run.kept["flat"] = embed(base, 2).coordinates
+        base = LLE(NEIGHBORS).fit(livers.vectors)
+        run.kept["eigenvalues"] = base.dimension().eigenvalues
+        run.kept["flat"] = base.embedding_
         run.notices += _spectrum_notices(spectra)
 
     def summary(self, run: Run[InSilicoSettings]) -> dict[str, float]:
@@ -172,9 +172,9 @@ def populate(settings: InSilicoSettings) -> Population:
 
 def spectrum_row(vectors: FloatArray, k: int, regularization: float) -> Row:
     """Dimension by the largest ratio of neighbouring eigenvalues, and whether the sixth leads."""
-    base = fit(vectors, k, regularization=regularization)
-    found = estimate_dimension(base, n_values=PARAMETERS + 8)
-    values = np.maximum(found.eigenvalues, np.finfo(float).eps * len(base))
+    base = LLE(k, regularization=regularization).fit(vectors)
+    found = base.dimension(n_values=PARAMETERS + 8)
+    values = np.maximum(found.eigenvalues, np.finfo(float).eps * len(base.vectors_))
     return {
         "kind": "spectrum",
         "k": k,
@@ -189,8 +189,8 @@ def spectrum_row(vectors: FloatArray, k: int, regularization: float) -> Row:
 
 def held_out_rows(livers: Population, settings: InSilicoSettings) -> list[Row]:
     """Return the errors of each held-out liver, interpolated among the base."""
-    base = fit(livers.vectors[: settings.n_base], NEIGHBORS)
-    everyone = fit(livers.vectors[: settings.n_base], settings.n_base - 1)
+    base = LLE(NEIGHBORS).fit(livers.vectors[: settings.n_base])
+    everyone = LLE(settings.n_base - 1).fit(livers.vectors[: settings.n_base])
     held_out = range(settings.n_base, settings.n_base + settings.n_held_out)
     rows: list[Row] = []
     for i in follow(held_out, "held-out livers"):

@@ -20,7 +20,7 @@ from avatar_core.common.arrays import FloatArray
 from avatar_core.common.processes import repeatable
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.shapes.barycenter import barycenter
-from avatar_core.shapes.lle import LLE, embed, fit
+from avatar_core.shapes.lle import LLE
 from avatar_core.studies.shapes import PAPER_GRID, distance_vectors, paper_box
 from avatar_core.studies.study import Row, Run, Study, column, follow, label, mean_and_worst, where
 
@@ -161,8 +161,8 @@ def time_lle(vectors: FloatArray, repeats: int) -> Timing:
     """Return the weights and embedding of all vectors, ours and scikit-learn's in turn."""
 
     def ours() -> LLE:
-        base = fit(vectors, NEIGHBORS, regularization=TIMED_REGULARIZATION)
-        embed(base, DIMENSION)  # which is timed too
+        base = LLE(NEIGHBORS, DIMENSION, regularization=TIMED_REGULARIZATION).fit(vectors)
+        _ = base.embedding_  # which is timed too
         return base
 
     theirs = _sklearn(vectors)

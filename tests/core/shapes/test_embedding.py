@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avatar_core.shapes.lle import Gram, embed, estimate_dimension, fit, local_variances
+from avatar_core.shapes.lle import LLE, Gram, local_variances
 
 
 @pytest.fixture(scope="module")
@@ -32,16 +32,15 @@ def explained(target: np.ndarray, coordinates: np.ndarray) -> float:
 
 
 def test_eigenvalues_are_the_reconstruction_errors_of_the_coordinates(cloud):
-    base = fit(cloud, 8, regularization=1e-3)
-    found = embed(base, 3)
-    y = found.coordinates
+    base = LLE(8, 3, regularization=1e-3).fit(cloud)
+    y = base.embedding_
     assert np.allclose(y.T @ y, len(cloud) * np.eye(3), atol=1e-9)
     assert np.allclose(y.mean(axis=0), 0.0, atol=1e-9)
     errors = np.sum((y - base.weight_matrix @ y) ** 2, axis=0) / len(cloud)  # Eq. 16
     # one eigenvalue carries the rounding of M, about 1e-15
-    assert np.allclose(errors, found.eigenvalues, atol=1e-13)
+    assert np.allclose(errors, base.eigenvalues_, atol=1e-13)
     rest = np.eye(60) - base.weight_matrix
-    assert np.allclose(np.linalg.eigvalsh(rest.T @ rest)[1:4], found.eigenvalues, atol=1e-13)
+    assert np.allclose(np.linalg.eigvalsh(rest.T @ rest)[1:4], base.eigenvalues_, atol=1e-13)
 
 
 def test_embedding_spans_that_of_scikit_learn(cloud):
@@ -49,31 +48,28 @@ def test_embedding_spans_that_of_scikit_learn(cloud):
     theirs = manifold.LocallyLinearEmbedding(
         n_neighbors=10, n_components=3, reg=1e-3, eigen_solver="dense"
     ).fit_transform(cloud)
-    embedding = embed(fit(cloud, 10, regularization=1e-3), 3)
-    ours = embedding.coordinates
+    ours = LLE(10, 3, regularization=1e-3).fit_transform(cloud)
     a, b = np.linalg.qr(theirs)[0], np.linalg.qr(ours)[0]
     assert np.linalg.svd(a.T @ b, compute_uv=False).min() > 1 - 1e-9
 
 
 def test_embedding_of_an_affine_family_is_affine_in_its_parameters(flat):
     t, points = flat
-    base = fit(points, 10, regularization=1e-9)
-    found = embed(base, 4)
+    base = LLE(10, 4, regularization=1e-9).fit(points)
     # regularisation 1e-9 of the trace against local variances of a hundredth of it
-    assert explained(t, found.coordinates) > 1 - 1e-6
+    assert explained(t, base.embedding_) > 1 - 1e-6
     # the affine map from parameters to coordinates holds out of sample too
     new = np.array([[0.1, -0.3, 0.5, 0.2], [0.0, 0.6, -0.2, -0.4]])
-    matrix = np.linalg.lstsq(np.c_[np.ones(150), t], found.coordinates, rcond=None)[0]
+    matrix = np.linalg.lstsq(np.c_[np.ones(150), t], base.embedding_, rcond=None)[0]
     slope = np.linalg.lstsq(np.c_[np.ones(150), t], points, rcond=None)[0]
-    for parameters in new:
-        point = base.barycenter(np.r_[1.0, parameters] @ slope)
-        assert found.of(point) == pytest.approx(np.r_[1.0, parameters] @ matrix, abs=1e-3)
-    assert np.array_equal(found.of(base.barycenter(points[7])), found.coordinates[7])
+    wanted = np.c_[np.ones(2), new]
+    assert base.transform(wanted @ slope) == pytest.approx(wanted @ matrix, abs=1e-3)
+    assert np.array_equal(base.transform(points), base.embedding_)
 
 
 def test_swiss_roll_is_unrolled():
     parameters, points = swiss_roll(800)
-    found = embed(fit(points, 8, regularization=1e-2), 2).coordinates
+    found = LLE(8, regularization=1e-2).fit_transform(points)
     order = np.argsort(np.argsort(parameters[:, 0]))
     along = [abs(np.corrcoef(order, np.argsort(np.argsort(c)))[0, 1]) for c in found.T]
     # over 3 seeds 0.998 to 1.000; larger k short-cuts between the layers (0.7)
@@ -86,7 +82,7 @@ def test_swiss_roll_is_unrolled():
 def test_dimension_of_affine_families(d):
     rng = np.random.default_rng(d)
     points = rng.uniform(-1, 1, (200, d)) @ rng.standard_normal((d, 60))
-    found = estimate_dimension(fit(points, 12))
+    found = LLE(12).fit(points).dimension()
     assert (found.from_gap, found.from_local_pca, found.agree) == (d, d, True)
     assert found.notices == ()
     assert found.gap > 100
@@ -95,18 +91,18 @@ def test_dimension_of_affine_families(d):
 
 
 def test_local_variances_find_a_curved_sheet_and_full_noise():
-    rolled = fit(swiss_roll(800)[1], 10, regularization=1e-3)
-    assert estimate_dimension(rolled).from_local_pca == 2
+    rolled = LLE(10, regularization=1e-3).fit(swiss_roll(800)[1])
+    assert rolled.dimension().from_local_pca == 2
     rng = np.random.default_rng(6)
-    noise = estimate_dimension(fit(rng.standard_normal((200, 40)), 12))
+    noise = LLE(12).fit(rng.standard_normal((200, 40))).dimension()
     assert noise.gap < 3  # nothing stands out
     assert noise.notices[0].startswith("no clear gap")
     assert noise.from_local_pca >= 10
 
 
 def test_local_variances_equal_those_of_the_singular_values(cloud):
-    base = fit(cloud, 7)
-    near = cloud[base.neighbors[11]]
+    base = LLE(7).fit(cloud)
+    near = cloud[base.neighbors_[11]]
     squared = np.linalg.svd(near - near.mean(axis=0), compute_uv=False)[:6] ** 2
     assert np.allclose(local_variances(base)[11], squared / squared.sum(), atol=1e-12)
 
@@ -125,7 +121,21 @@ def test_inner_products_are_those_about_the_mean_and_grow_about_it(cloud):
 
 
 def test_known_inner_products_are_used(cloud):
-    base = fit(cloud, 8)
-    again = fit(cloud, 8, gram=base.gram)
-    assert again.gram is base.gram
-    assert np.array_equal(again.weights, base.weights)
+    base = LLE(8).fit(cloud)
+    again = LLE(8).fit(cloud, gram=base.gram_)
+    assert again.gram_ is base.gram_
+    assert np.array_equal(again.weights_, base.weights_)
+
+
+def test_the_estimator_keeps_the_manners_of_scikit_learn(cloud):
+    base = pytest.importorskip("sklearn.base")
+    lle = LLE(8, 3, regularization=1e-3)
+    assert base.clone(lle).get_params() == lle.get_params()
+    assert not [name for name in vars(lle) if name.endswith("_")]  # before it is fitted
+    y = lle.fit_transform(cloud)
+    assert y is lle.embedding_ and lle.eigenvalues_.shape == (3,)
+    assert np.array_equal(lle.transform(cloud[:5]), y[:5])
+    again = lle.set_params(n_components=2).fit(cloud)
+    assert again is lle and lle.embedding_.shape == (60, 2)
+    np.testing.assert_allclose(lle.embedding_, y[:, :2], atol=1e-9)
+    assert repr(LLE(8)).startswith("LLE(n_neighbors=8, n_components=2,")

@@ -31,7 +31,7 @@ from avatar_core.shapes.barycenter import (
     convex_weights,
     local_gram,
 )
-from avatar_core.shapes.lle import LLE, Gram, embed, estimate_dimension, fit, spectrum
+from avatar_core.shapes.lle import LLE, Gram
 from tests.helpers.examples import examples
 
 NONE = 1e-12  # a regularisation that is almost none
@@ -57,11 +57,11 @@ def test_weights_do_not_see_rotation_scale_and_shift(cloud, regularization):
     rng = np.random.default_rng(4)
     turn = np.linalg.qr(rng.standard_normal((200, 200)))[0]
     moved = 7.0 * cloud @ turn + 30 * rng.standard_normal(200)
-    one = fit(cloud, 8, regularization=regularization)
-    other = fit(moved, 8, regularization=regularization)
-    assert np.array_equal(one.neighbors, other.neighbors)
+    one = LLE(8, regularization=regularization).fit(cloud)
+    other = LLE(8, regularization=regularization).fit(moved)
+    assert np.array_equal(one.neighbors_, other.neighbors_)
     # 1e-15 relative rounding times a condition of up to 1e5 (three dimensions, curved)
-    assert np.allclose(one.weights, other.weights, atol=1e-9)
+    assert np.allclose(one.weights_, other.weights_, atol=1e-9)
 
 
 def test_point_in_the_affine_hull_is_reproduced_and_so_is_every_affine_map():
@@ -84,7 +84,7 @@ def test_point_in_the_affine_hull_is_reproduced_and_so_is_every_affine_map():
 def test_weights_equal_those_of_scikit_learn(cloud, k, regularization):
     reference = pytest.importorskip("sklearn.manifold._locally_linear")
     theirs = reference.barycenter_kneighbors_graph(cloud, k, reg=regularization).toarray()
-    ours = fit(cloud, k, regularization=regularization).weight_matrix
+    ours = LLE(k, regularization=regularization).fit(cloud).weight_matrix
     assert np.abs(ours - theirs).max() < 1e-8  # the agreement asked for
 
 
@@ -94,7 +94,7 @@ def test_a_base_far_from_zero_keeps_its_digits(cloud):
     far = cloud + 1e4
     far[30:] += 3e4
     theirs = reference.barycenter_kneighbors_graph(far, 8, reg=1e-6).toarray()
-    assert np.abs(fit(far, 8).weight_matrix - theirs).max() < 1e-8
+    assert np.abs(LLE(8).fit(far).weight_matrix - theirs).max() < 1e-8
 
 
 def test_condition_of_known_neighbourhoods():
@@ -163,14 +163,14 @@ def test_member_has_weight_one_on_itself(cloud, k, convex):
 def test_equal_members_count_once(cloud):
     unique = cloud[:20]
     twice = np.vstack([unique, unique[3], unique[[3, 7]] * (1 + 1e-12)])
-    base, clean = fit(twice, 6), fit(unique, 6)
+    base, clean = LLE(6).fit(twice), LLE(6).fit(unique)
     assert base.repeated == (20, 21, 22)
-    assert base.same_as[20:].tolist() == [3, 3, 7]
-    assert np.array_equal(base.neighbors[:20], clean.neighbors)
-    assert np.allclose(base.weights[:20], clean.weights, atol=1e-12)
+    assert base.same_as_[20:].tolist() == [3, 3, 7]
+    assert np.array_equal(base.neighbors_[:20], clean.neighbors_)
+    assert np.allclose(base.weights_[:20], clean.weights_, atol=1e-12)
     assert np.array_equal(base.weight_matrix[20:], np.eye(23)[[3, 3, 7]])
     assert "member 20 equals member 3" in base.notices
-    coordinates = embed(base, 2).coordinates
+    coordinates = base.embedding_
     assert np.allclose(coordinates[20:], coordinates[[3, 3, 7]], atol=1e-9)
     query = base.barycenter(unique[3])
     assert query.member == 3
@@ -190,28 +190,30 @@ def test_members_left_out_have_no_weight(cloud):
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda x: fit([], 3), "empty; add"),
+        (lambda x: LLE(3).transform(x), "call fit first"),
+        (lambda x: LLE(3).set_params(k=4), "no parameter 'k'; choose n_neighbors"),
+        (lambda x: LLE(3).fit([]), "empty; add"),
         (lambda x: barycenter([], x[0], 3), "empty; add"),
-        (lambda x: fit(x, 0), "choose at least 1"),
+        (lambda x: LLE(0).fit(x), "choose at least 1"),
         (lambda x: barycenter(x, x[0], -2), "choose at least 1"),
         (lambda x: barycenter(x, x[0] * np.nan, 3), "NaN or infinite"),
-        (lambda x: fit(np.vstack([x, x[:1] * np.inf]), 3), "vector 60 is NaN"),
+        (lambda x: LLE(3).fit(np.vstack([x, x[:1] * np.inf])), "vector 60 is NaN"),
         (lambda x: barycenter(np.vstack([x, x[:1] * np.nan]), x[0] + 1, 60), "vector 60 is NaN"),
-        (lambda x: fit(x, 3).barycenter(x[0] / 0.0), "NaN or infinite"),
-        (lambda x: fit([x[0], x[1][:-1]], 1), "differ in length"),
+        (lambda x: LLE(3).fit(x).barycenter(x[0] / 0.0), "NaN or infinite"),
+        (lambda x: LLE(1).fit([x[0], x[1][:-1]]), "differ in length"),
         (lambda x: barycenter([x[0], x[1][:1]], x[2], 2), "differ in length"),
-        (lambda x: fit(x, 3).barycenter(x[0][:-1]), "grid of the base"),
-        (lambda x: fit(x, 3, gram=Gram.of(x[:4])), "compute it again"),
-        (lambda x: fit(x, 3, regularization=0.0), "regularisation 0"),
+        (lambda x: LLE(3).fit(x).barycenter(x[0][:-1]), "grid of the base"),
+        (lambda x: LLE(3).fit(x, gram=Gram.of(x[:4])), "compute it again"),
+        (lambda x: LLE(3, regularization=0.0).fit(x), "regularisation 0"),
         (lambda x: barycenter(x, x[0], 3, regularization=np.nan), "regularisation nan"),
         (lambda x: barycenter(x[:2], x[5], 3, leave_out=(0, 1)), "leave out fewer"),
-        (lambda x: embed(fit(x, 5), 0), "0 dimension"),
-        (lambda x: spectrum(fit(x, 5), 60), "60 dimension"),
-        (lambda x: estimate_dimension(fit(x[:3], 5)), "at least 4"),
-        (lambda x: estimate_dimension(fit(x, 1)), "at least 4 and 2"),
-        (lambda x: embed(fit(x[:1], 10), 1), "add some"),
-        (lambda x: embed(fit([x[0]] * 5, 3), 1), "different anatomies"),
-        (lambda x: estimate_dimension(fit(x[:1], 10)), "from 1 different anatomies"),
+        (lambda x: LLE(5, 0).fit_transform(x), "0 dimension"),
+        (lambda x: LLE(5).fit(x).spectrum(60), "60 dimension"),
+        (lambda x: LLE(5).fit(x[:3]).dimension(), "at least 4"),
+        (lambda x: LLE(1).fit(x).dimension(), "at least 4 and 2"),
+        (lambda x: LLE(10, 1).fit_transform(x[:1]), "add some"),
+        (lambda x: LLE(3, 1).fit_transform([x[0]] * 5), "different anatomies"),
+        (lambda x: LLE(10).fit(x[:1]).dimension(), "from 1 different anatomies"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:divide by zero", "ignore:invalid value")
@@ -226,16 +228,13 @@ def test_bad_requests_name_cause_and_remedy(cloud, call, words):
 
 def with_one_more(base: LLE, point: np.ndarray) -> LLE:
     """As an atlas grows: one more row of inner products, about the same origin."""
-    return fit(
-        (*base.vectors, point),
-        base.n_neighbors,
-        regularization=base.regularization,
-        gram=base.gram.grown(base.vectors, point),
+    return LLE(base.n_neighbors, regularization=base.regularization).fit(
+        (*base.vectors_, point), gram=base.gram_.grown(base.vectors_, point)
     )
 
 
 def grown(points: np.ndarray, start: int, k: int, **options: float) -> LLE:
-    base = fit(points[:start], k, **options)
+    base = LLE(k, **options).fit(points[:start])
     for point in points[start:]:
         base = with_one_more(base, point)
     return base
@@ -246,18 +245,17 @@ def grown(points: np.ndarray, start: int, k: int, **options: float) -> LLE:
 )
 def test_base_grown_one_by_one_equals_the_batch(cloud, start, k, regularization):
     one_by_one = grown(cloud, start, k, regularization=regularization)
-    batch = fit(cloud, k, regularization=regularization)
-    assert np.array_equal(one_by_one.neighbors, batch.neighbors)
-    assert np.abs(one_by_one.weights - batch.weights).max() < 1e-10  # the agreement asked for
-    d = 2
-    a, b = (np.linalg.qr(embed(base, d).coordinates)[0] for base in (one_by_one, batch))
+    batch = LLE(k, regularization=regularization).fit(cloud)
+    assert np.array_equal(one_by_one.neighbors_, batch.neighbors_)
+    assert np.abs(one_by_one.weights_ - batch.weights_).max() < 1e-10  # the agreement asked for
+    a, b = (np.linalg.qr(base.embedding_)[0] for base in (one_by_one, batch))
     # singular values 1: the same subspace, so the same map up to sign and rotation
     assert np.linalg.svd(a.T @ b, compute_uv=False).min() > 1 - 1e-6
 
 
 def test_base_with_equals_grows_like_the_batch(cloud):
     points = np.vstack([cloud[:12], cloud[4], cloud[12:20], cloud[15]])
-    one_by_one, batch = grown(points, 2, 5), fit(points, 5)
+    one_by_one, batch = grown(points, 2, 5), LLE(5).fit(points)
     assert one_by_one.repeated == batch.repeated == (12, 21)
     assert np.abs(one_by_one.weight_matrix - batch.weight_matrix).max() < 1e-10
 
@@ -279,16 +277,16 @@ def sound(found: Barycenter, base: np.ndarray, x: np.ndarray, r: float) -> None:
 
 def rows_are_sound(base: LLE, r: float) -> None:
     """The same of the weights of every member that has neighbours."""
-    has = len(base) - len(base.repeated) > 1
-    assert np.isfinite(base.weights).all()
+    has = len(base.vectors_) - len(base.repeated) > 1
+    assert np.isfinite(base.weights_).all()
     sums = base.weight_matrix.sum(axis=1)
-    first = base.same_as == np.arange(len(base))
+    first = base.same_as_ == np.arange(len(base.vectors_))
     wanted = np.where(first & (not has), 0.0, 1.0)
-    k = base.weights.shape[1]
+    k = base.weights_.shape[1]
     np.testing.assert_array_less(
-        np.abs(sums - wanted), 2.0 * k * EPS * np.abs(base.weights).sum(axis=1) + EPS
+        np.abs(sums - wanted), 2.0 * k * EPS * np.abs(base.weights_).sum(axis=1) + EPS
     )
-    assert (np.square(base.weights).sum(axis=1) <= (1.0 + 1.0 / (r * k)) * (1.0 + 1e-3)).all()
+    assert (np.square(base.weights_).sum(axis=1) <= (1.0 + 1.0 / (r * k)) * (1.0 + 1e-3)).all()
 
 
 # --- any base at all --------------------------------------------------------------------------
@@ -337,13 +335,13 @@ def test_any_base_gives_bounded_weights_that_sum_to_one(
     if single:
         read = base.astype(np.float32)
         base = read.astype(np.float64)
-        held = fit(read, k, regularization=r).weights
+        held = LLE(k, regularization=r).fit(read).weights_
         assert held.dtype == np.float64
-        assert np.array_equal(held, fit(base, k, regularization=r).weights)
-    grown = fit(base[:1], k, regularization=r)
+        assert np.array_equal(held, LLE(k, regularization=r).fit(base).weights_)
+    grown = LLE(k, regularization=r).fit(base[:1])
     for row in base[1:]:
         grown = with_one_more(grown, row)
-    for one in (fit(base, k, regularization=r), grown):
+    for one in (LLE(k, regularization=r).fit(base), grown):
         rows_are_sound(one, r)
     v = rng.uniform(-1.0, 1.0, n)
     v = v / v.sum() if abs(v.sum()) > 0.1 else np.full(n, 1.0 / n)
@@ -381,7 +379,7 @@ def test_near_duplicates_of_a_hundredth_of_a_millimetre(livers: np.ndarray) -> N
     rng = np.random.default_rng(1)
     again = livers[:6] + NEAR * rng.uniform(-1.0, 1.0, (6, livers.shape[1]))
     both = np.vstack([livers, again])
-    base, clean = fit(both, 18), fit(livers, 12)
+    base, clean = LLE(18).fit(both), LLE(12).fit(livers)
     assert base.repeated == ()
     rows_are_sound(base, DEFAULT_REGULARIZATION)
     rms = NEAR / np.sqrt(3.0)
@@ -393,11 +391,11 @@ def test_near_duplicates_of_a_hundredth_of_a_millimetre(livers: np.ndarray) -> N
         assert left**2 <= squared[12 + i] + DEFAULT_REGULARIZATION * squared.sum()
     # among copies even nearer, as exact as from differences, though the Gram matrix is not
     part = 0.1 * (again - livers[:6])
-    close = fit(np.vstack([livers[:6], livers[:6] + part, livers[:6] - 0.5 * part]), 2)
+    close = LLE(2).fit(np.vstack([livers[:6], livers[:6] + part, livers[:6] - 0.5 * part]))
     for i in range(18):
-        exact = barycenter(close.vectors, close.vectors[i], 2, leave_out=[i])
-        np.testing.assert_array_equal(close.neighbors[i], exact.neighbors)
-        np.testing.assert_allclose(close.weights[i], exact.weights, rtol=0.0, atol=TRUSTED)
+        exact = barycenter(close.vectors_, close.vectors_[i], 2, leave_out=[i])
+        np.testing.assert_array_equal(close.neighbors_[i], exact.neighbors)
+        np.testing.assert_allclose(close.weights_[i], exact.weights, rtol=0.0, atol=TRUSTED)
     for _ in range(10):
         v = rng.dirichlet(np.ones(12))
         one, other = base.barycenter(v @ livers), clean.barycenter(v @ livers)
@@ -407,26 +405,26 @@ def test_near_duplicates_of_a_hundredth_of_a_millimetre(livers: np.ndarray) -> N
 
 
 def test_one_neighbour(livers: np.ndarray) -> None:
-    base = fit(livers, 1)
+    base = LLE(1).fit(livers)
     nearest = np.linalg.norm(livers[:, None] - livers, axis=2) + np.diag(np.full(12, np.inf))
-    assert np.array_equal(base.neighbors[:, 0], nearest.argmin(axis=1))
-    assert np.array_equal(base.weights, np.ones((12, 1)))
+    assert np.array_equal(base.neighbors_[:, 0], nearest.argmin(axis=1))
+    assert np.array_equal(base.weights_, np.ones((12, 1)))
     found = base.barycenter(livers[4] + NEAR)
     assert found.member is None and found.neighbors.tolist() == [4]
     assert found.residual == pytest.approx(NEAR * np.sqrt(livers.shape[1]), rel=1e-9)
     assert np.array_equal(found.combine(livers), livers[4])
-    y = embed(base, 2).coordinates
+    y = base.embedding_
     np.testing.assert_allclose(y.T @ y, 12.0 * np.eye(2), atol=1e-9)
 
 
 @pytest.mark.parametrize("k", [11, 12, 13, 1000])
 def test_all_neighbours_and_more(livers: np.ndarray, k: int) -> None:
     """Every other member is used, and the notice says so."""
-    base = fit(livers, k)
-    assert base.weights.shape == (12, 11)
+    base = LLE(k).fit(livers)
+    assert base.weights_.shape == (12, 11)
     notice = f"{k} neighbours asked for, {{}} used: the base has no more"
     assert base.notices == ((notice.format(11),) if k > 11 else ())
-    np.testing.assert_array_equal(base.weights, fit(livers, 11).weights)
+    np.testing.assert_array_equal(base.weights_, LLE(11).fit(livers).weights_)
     rng = np.random.default_rng(k)
     v = rng.dirichlet(np.ones(12))
     found = base.barycenter(v @ livers)
@@ -446,7 +444,7 @@ def test_a_gram_matrix_without_trace() -> None:
         shares = convex_weights(gram)
         assert shares.min() >= 0.0 and shares.sum() == pytest.approx(1.0)
     x = np.full(40, 0.1)
-    alike = fit([x] * 5, 3)
+    alike = LLE(3).fit([x] * 5)
     assert alike.repeated == (1, 2, 3, 4)
     rows_are_sound(alike, DEFAULT_REGULARIZATION)
     assert alike.barycenter(x).member == 0
@@ -458,13 +456,13 @@ def test_a_gram_matrix_without_trace() -> None:
 )
 def test_a_query_equal_to_a_member(livers: np.ndarray, kind: type, shift: float) -> None:
     """Each one is known again, and no neighbour is taken for it, wherever the zero is."""
-    base = fit(livers + shift, 8)
+    base = LLE(8).fit(livers + shift)
     for i in range(len(livers)):
         found = base.barycenter((livers[i] + shift).astype(kind))
         assert (found.member, found.neighbors[0]) == (i, i)
         assert found.weights.tolist() == [1.0] + 7 * [0.0]
         assert np.array_equal(found.combine(livers), livers[i])
-        assert with_one_more(base, (livers[i] + shift).astype(kind)).same_as[-1] == i
+        assert with_one_more(base, (livers[i] + shift).astype(kind)).same_as_[-1] == i
         beside = (livers[i] + shift + NEAR).astype(kind)
         assert base.barycenter(beside).member is None
         assert with_one_more(base, beside).repeated == ()
@@ -484,9 +482,12 @@ def test_translation_and_order_change_nothing(livers: np.ndarray, convex: bool) 
     ):
         assert np.array_equal(number[other.neighbors], one.neighbors)
         assert np.array_equal(other.weights, one.weights)
-    base, moved = fit(exact, 9, convex=convex), fit((exact + shift)[order], 9, convex=convex)
+    base, moved = (
+        LLE(9, convex=convex).fit(exact),
+        LLE(9, convex=convex).fit((exact + shift)[order]),
+    )
     if convex:
-        assert base.weights.min() >= 0.0
+        assert base.weights_.min() >= 0.0
     off = np.abs(moved.weight_matrix - base.weight_matrix[np.ix_(order, order)]).max()
     # rounding of the sums about the origin, which is 300 times as far away
     assert off < 1e-8

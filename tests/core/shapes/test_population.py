@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.level_set import DistanceGrid, distance_in_box, padded_box
 from avatar_core.geometry.phantom import ShapeMap, population
-from avatar_core.shapes.lle import fit
+from avatar_core.shapes.lle import LLE
 from tests.core.shapes.test_embedding import explained
 
 
@@ -26,7 +26,7 @@ def in_silico(phantom) -> tuple[list[ShapeMap], list[DistanceGrid]]:
 def test_held_out_organs_are_interpolated(in_silico):
     _, grids = in_silico
     vectors = [grid.values.ravel() for grid in grids]
-    base = fit(vectors[:45], 12)
+    base = LLE(12).fit(vectors[:45])
     for grid, vector in zip(grids[45:], vectors[45:], strict=True):
         found = base.barycenter(vector)
         guess = DistanceGrid(
@@ -73,4 +73,4 @@ def test_rotations_of_an_organ_are_not_mistaken_for_it(phantom):
     moved = type(phantom)(phantom.vertices @ turned.T, phantom.faces)
     box = padded_box([phantom, moved], 15e-3, 15e-3)
     vectors = [distance_in_box(organ, box).values.ravel() for organ in (phantom, moved)]
-    assert fit(vectors, 1).repeated == ()
+    assert LLE(1).fit(vectors).repeated == ()
