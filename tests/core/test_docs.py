@@ -1,8 +1,10 @@
-"""The README and the pages of msg_docs: links that lead somewhere, headings in order."""
+"""The README and the pages of msg_docs: links that lead somewhere, headings in order, HTML."""
 
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -58,3 +60,16 @@ def test_every_page_can_be_reached_from_the_readme() -> None:
             reached.add(page)
             ahead += [target for target, _ in links(page)]
     assert not set(PAGES) - reached
+
+
+def test_the_pages_become_html_without_a_warning(tmp_path: Path) -> None:
+    """Links, anchors, pictures and the docstrings of the public names."""
+    for module in ("sphinx", "myst_parser", "furo", "sphinxcontrib.mermaid"):
+        pytest.importorskip(module)
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", str(DOCS), str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    first = (tmp_path / "index.html").read_text()
+    for page in PAGES:
+        html = page.relative_to(DOCS).with_suffix(".html").as_posix()
+        assert (tmp_path / html).exists() and f'href="{html}"' in first, html
