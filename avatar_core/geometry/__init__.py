@@ -1,4 +1,5 @@
-"""From a file to a mesh. A surface or a label map comes in [any unit]; a checked surface, its
-signed distance (level set) and a tetrahedral mesh with clamped and accessible regions go out [m,
-RAS].
+"""Read surfaces and label maps, and mesh them.
+
+The input is a surface or a label map in any unit. The output is a checked surface, its signed
+distance (level set) and a tetrahedral mesh with clamped and accessible regions [m, RAS].
 """

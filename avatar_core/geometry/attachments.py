@@ -1,9 +1,9 @@
-"""Where a liver is attached to its surroundings, by rule from its shape or by groups of points.
+"""Attachments of a liver to its surroundings, by rule from its shape or by groups of points.
 
-Axes RAS. What the shape of the parenchyma tells of its attachments is little: the rules below place
-them where atlases of anatomy have them (Abdel-Misih & Bloomston, "Liver anatomy", Surgical Clinics
-of North America 90:643, 2010), in fractions of the organ's width. Those of a patient are in the
-images: give them as groups of points (:mod:`avatar_core.geometry.groups`).
+Axes are RAS. The shape of the parenchyma says little about its attachments. The rules below place
+them where atlases of anatomy have them, in fractions of the organ's width (Abdel-Misih & Bloomston,
+"Liver anatomy", Surgical Clinics of North America 90:643, 2010). A patient's own attachments are in
+the images: give them as groups of points (:mod:`avatar_core.geometry.groups`).
 
     cava_groove       a band of the posterior surface along the inferior vena cava
     bare_area         right of it, the part without peritoneum between the coronary ligaments
@@ -59,7 +59,7 @@ def attachments_by_rule(mesh: TetMesh) -> dict[str, np.ndarray]:
 
 
 def _farthest(mesh: TetMesh, direction: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """Of some faces those farthest in a direction, up to ``BARE_FRACTION`` of the surface."""
+    """Return the given faces farthest in a direction, up to ``BARE_FRACTION`` of the surface."""
     height = mesh.vertices[mesh.boundary_faces].mean(axis=1) @ direction
     order = np.argsort(np.where(among, -height, np.inf), kind="stable")[: int(among.sum())]
     out = np.zeros(len(height), bool)

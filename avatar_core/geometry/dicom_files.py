@@ -20,8 +20,9 @@ _TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])  # the patient's axes of DICOM are LPS
 def read_segmentation(path: Path) -> Volume:
     """Return a segmentation (SEG) in one file, its segments named by their numbers.
 
-    BINARY and FRACTIONAL have a layer for each segment. A FRACTIONAL one holds the voxels from
-    half of MaximumFractionalValue on. Voxels of a LABELMAP are numbers of segments, 0 outside.
+    BINARY and FRACTIONAL files have a layer for each segment. A voxel of a FRACTIONAL file belongs
+    to the segment from half of MaximumFractionalValue on. Voxels of a LABELMAP are numbers of
+    segments, 0 outside.
 
     Raises SurfaceError for no segmentation, no regular volume, or without highdicom.
     """
@@ -96,7 +97,7 @@ def read_series(path: Path) -> Volume:
 
 
 def _libraries(name: str) -> tuple[Any, Any]:
-    """Return highdicom, and pydicom's reader of a file."""
+    """Return the module highdicom, and pydicom's reader of a file."""
     try:
         import highdicom
         from pydicom import dcmread
@@ -112,7 +113,7 @@ def _is_dicom(path: Path) -> bool:
 
 
 def _require_one_volume(name: str, heads: list[Any]) -> None:
-    """SurfaceError unless the files are one image of a size that can be held."""
+    """Raise SurfaceError unless the files are one image of a size that can be held."""
     if not heads:
         raise SurfaceError(f"{name}: no DICOM file in it; give the folder of a series")
     series = {str(head.get("SeriesInstanceUID", "")) for head in heads}

@@ -23,16 +23,19 @@ _SAMPLES = 32  # points along each side of a lesion's box
 def doubts_of(
     organ: SurfaceMesh, inside: Sequence[SurfaceMesh] = (), has_groups: bool = False
 ) -> tuple[str, ...]:
-    """Return the notices of what is doubtful of an organ and its lesions, one line each.
-
-    Raises SurfaceError if less than half of a lesion lies in the organ.
+    """Return notices of doubts about an organ and its lesions, one line each.
 
     Parameters
     ----------
     inside : Sequence[SurfaceMesh]
         Surfaces of lesions.
     has_groups : bool
-        Clamp and accessible region are given by groups.
+        Whether clamp and accessible region are given by groups.
+
+    Raises
+    ------
+    SurfaceError
+        If less than half of a lesion lies in the organ.
     """
     placed = [notice for lesion in inside for notice in _placement(organ, lesion)]
     return (*placed, *(() if has_groups else size_notice(organ)), *_bridge_notice(organ))
@@ -51,7 +54,7 @@ def size_notice(organ: SurfaceMesh) -> tuple[str, ...]:
 
 
 def _placement(organ: SurfaceMesh, lesion: SurfaceMesh) -> tuple[str, ...]:
-    """How much of a lesion lies in the organ; nothing if it is all, in the organ's own file."""
+    """Return a notice of the part of a lesion outside the organ; nothing if it lies inside."""
     points = box_points(*lesion.bounding_box, (_SAMPLES,) * 3)
     points = points[lesion.skin.contains(points)]
     points = points if len(points) else lesion.vertices

@@ -1,9 +1,10 @@
 """Parts of an organ's boundary from groups of points, as a segmentation of the images gives them.
 
 A boundary face belongs to a group if half of it lies between the group's points: seen from there
-along the surface, they stand on all sides. Nodes of another mesh and voxels of a segmentation so
-give the area that they cover, and not one that is wider by an edge. Up to three points stand for
-the faces whose corners are all within the mesh's mean surface edge of one.
+along the surface, they stand on all sides. Nodes of another mesh and voxels of a segmentation
+therefore give the area that they cover, and not an area wider by an edge. A group of up to three
+points is too small to cover anything. It selects the faces whose corners all lie within the mesh's
+mean surface edge of a point.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def read_groups(path: str | Path) -> dict[str, np.ndarray]:
     Raises
     ------
     MeshError
-        For a file that is none, or groups that are no points.
+        If the file cannot be read, or a group holds no points.
     """
     try:
         with np.load(path, allow_pickle=False) as groups:
@@ -53,9 +54,9 @@ def faces_of_groups(mesh: TetMesh, points: Mapping[str, np.ndarray]) -> dict[str
 def regions_of_groups(
     mesh: TetMesh, points: Mapping[str, np.ndarray], source: str | Path = "points"
 ) -> Regions:
-    """Clamp and accessible surface from the groups ``clamped`` and ``accessible`` [m].
+    """Return clamp and accessible surface from the groups ``clamped`` and ``accessible`` [m].
 
-    Raises MeshError, which names their source, if one is missing.
+    Raises MeshError, which names the source of the groups, if one is missing.
     """
     for name in REGIONS:
         if name not in points:
@@ -65,7 +66,7 @@ def regions_of_groups(
 
 
 def regions_from_groups(mesh: TetMesh, path: str | Path) -> Regions:
-    """Return :func:`regions_of_groups` of a file."""
+    """Return the result of :func:`regions_of_groups` for a file."""
     return regions_of_groups(mesh, read_groups(path), path)
 
 

@@ -1,4 +1,4 @@
-"""Heights of tangent planes over a surface: what a tip meets around the point it touches."""
+"""Heights of tangent planes over a surface, which a tip meets around its contact point."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ def heights_around(
     angles: np.ndarray,
     steepest: float,
 ) -> np.ndarray:
-    """Heights of the planes across the normals over the surface, shape (n, radii, angles) [m].
+    """Return heights of tangent planes over the surface, shape (n, radii, angles) [m].
 
-    A point of the circle at q, whose closest point of the surface is c, at the angle a from n, is
-    |q - c| / cos(a) above it: exact over a plane side, to fourth order over a ball.
+    Let q be a point of the circle, c its closest point of the surface, and a the angle between q -
+    c and n. The plane at q lies |q - c| / cos(a) above the surface: exact over a plane side, to
+    fourth order over a ball.
 
     Parameters
     ----------

@@ -44,16 +44,16 @@ _NIFTI_MM = {1: 1e3, 2: 1.0, 3: 1e-3}  # length of the units of a header; 0, unk
 _NRRD_MM = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "": 1.0, "???": 1.0}
 _APART = 0.5  # between the places that qform and sform give a voxel, from which on it is said [mm]
 _OFF = 0.1  # from a whole number, at most, of a label
-_EXACT = 1e-3  # from a whole number, that is not worth a notice
+_EXACT = 1e-3  # from a whole number, distance below which no notice is given
 
 
 def is_label_map(path: Path) -> bool:
-    """Whether a file's name, or if that tells nothing its beginning, is that of a label map."""
+    """Return whether a file is a label map, by its name or else by its beginning."""
     return kind_of(path) in LABEL_MAPS
 
 
 def read_label_map(path: Path) -> Volume:
-    """Return all layers of a file, as whole numbers; what is not a number is 0, as outside.
+    """Return all layers of a file as whole numbers; NaN and infinity become 0, which is outside.
 
     Raises
     ------
@@ -68,11 +68,11 @@ def read_label_map(path: Path) -> Volume:
 
 
 def read_image(path: Path) -> Volume:
-    """Return the one image of a file, or of a folder with a series of DICOM.
+    """Return the image of a file, or of a folder with one DICOM series.
 
-    NaN becomes 0, or the darkest value if that is below.
+    NaN becomes 0, or the darkest value if that is below 0.
 
-    Raises SurfaceError as :func:`read_label_map`, and for several layers.
+    Raises SurfaceError like :func:`read_label_map`, and for several layers.
     """
     found = read_series(path) if path.is_dir() else _read(path, read_series)
     if len(found.values) != 1:
@@ -116,7 +116,7 @@ def _whole(values: NDArray[Any], name: str) -> tuple[NDArray[np.int32], tuple[st
 
 
 def _read_nifti(path: Path) -> Volume:
-    """A volume of either version, packed or not; its world coordinates are RAS by definition."""
+    """Return a volume of either NIfTI version, packed or not; its axes are RAS by definition."""
     import nibabel
 
     with path.open("rb") as file:
@@ -128,7 +128,7 @@ def _read_nifti(path: Path) -> Volume:
 
 
 def _volume_of(image: Any, path: Path) -> Volume:
-    """Its voxels, which are loaded only if they are not too many."""
+    """Return the volume of an image, whose voxels are loaded only if they are not too many."""
     if not (image.header["qform_code"] or image.header["sform_code"]):
         raise SurfaceError(
             f"{path.name}: does not say where its axes point (qform and sform code 0); save it "
@@ -172,7 +172,7 @@ def _differing_forms(image: Any, mm: float) -> tuple[str, ...]:
 
 
 def _read_nrrd(path: Path) -> Volume:
-    """A volume with its header in the same file, as Slicer saves label maps and segmentations."""
+    """Return a volume with its header in the same file, as Slicer saves label maps."""
     import nrrd
 
     with path.open("rb") as source:
@@ -240,7 +240,7 @@ def _inflated(content: bytes, n_bytes: int) -> bytes:
 
 
 def _space(name: str, header: Any, directions: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
-    """Map (4, 4) from indices to RAS [mm], and a notice if the file does not say its origin."""
+    """Return the map (4, 4) from indices to RAS [mm], and a notice if the file states no origin."""
     space = str(header.get("space", "")).lower()
     units = [str(unit).strip('"') for unit in header.get("space units", [""] * 3)]
     if space not in _TO_RAS:
@@ -268,7 +268,8 @@ def _unplaced(name: str) -> SurfaceError:
 def _segments(header: Any, n_layers: int) -> tuple[Segment, ...]:
     """Return the segments that Slicer names, ``Segment0_Name``, ``_LabelValue`` and ``_Layer``.
 
-    Slicer before 4.11 writes neither: each segment has a layer of its own, which holds 1.
+    Slicer before 4.11 writes neither value nor layer: each segment then has its own layer, filled
+    with 1.
     """
     found: list[Segment] = []
     while (name := header.get(f"Segment{len(found)}_Name")) is not None:

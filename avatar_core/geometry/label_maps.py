@@ -1,4 +1,4 @@
-"""Label maps: voxels with a number for each organ, of which the surface of one is made.
+"""Label maps: voxels that hold the number of an organ. One organ's surface is made from them.
 
 Segments may have names, and several layers where they overlap;
 :mod:`avatar_core.geometry.label_files` reads them.
@@ -41,9 +41,9 @@ _LEVELS = (0.1, 0.9)  # between these
 
 
 def labels_of(path: str | Path) -> tuple[str, ...]:
-    """What can be chosen of a label map: names of its segments, or its numbers; for the user.
+    """Return the labels of a map, as names of its segments or as numbers.
 
-    Raises SurfaceError as :func:`surface_of_label` of a file that is none.
+    Raises SurfaceError like :func:`surface_of_label` if the file is no label map.
     """
     path = Path(path)
     return tuple(one.name for one in _segments(read_label_map(path), path.name))
@@ -60,16 +60,22 @@ def surface_of_label(
 
     Parameters
     ----------
-    label : number or name of a segment, or several with commas between; the only one if None
-    inside : further labels, as tumours; what the organ's label leaves out for them belongs to it
-    is_organ : say what was read, and what no organ has: cavities, an end at the image's border
-    mm : length of the file's unit [mm]
+    path : Path
+    label : int or str or None
+        Number or name of a segment, or several with commas between; the only segment if None.
+    inside : Sequence[str]
+        Further labels, such as tumours. Gaps that they fill in the organ's label belong to the
+        organ.
+    is_organ : bool
+        Whether notices report the labels read, cavities, and ends at the image's border.
+    mm : float
+        Length of the file's unit [mm].
 
     Raises
     ------
     SurfaceError
-        If the map is too large, is an image, has no such label, or fills a hole of the organ with
-        a label that was not given.
+        If the map is too large, is an image, or lacks the label. Also if a label that was not given
+        fills a hole of the organ.
     """
     found = read_label_map(path)
     affine = np.diag([mm, mm, mm, 1.0]) @ found.affine
@@ -99,7 +105,7 @@ def surface_of_label(
 
 
 def _require_voxels(name: str, affine: FloatArray) -> None:
-    """SurfaceError unless voxels are as long as wide, to some extent: a blur would take hours."""
+    """Raise SurfaceError if voxels are much longer than wide: a blur would take hours."""
     size = np.linalg.norm(affine[:3, :3], axis=0)
     if not (np.isfinite(affine).all() and 0.0 < size.max() <= _SLIMMEST * size.min()):
         sizes = " x ".join(f"{length:.3g}" for length in size)
@@ -112,7 +118,7 @@ def _require_voxels(name: str, affine: FloatArray) -> None:
 def _segments(found: Volume, name: str) -> tuple[Segment, ...]:
     """Return the segments of a map; without names, one for each number but zero.
 
-    Raises SurfaceError of an image.
+    Raises SurfaceError if the file is an image.
     """
     if found.segments:
         return found.segments
@@ -146,7 +152,7 @@ def _chosen(segments: Sequence[Segment], name: str, label: int | str | None) -> 
 
 
 def _fitting(segments: Sequence[Segment], label: str) -> Sequence[Segment]:
-    """Return the segments of that name, in any case if there is none, or of that number."""
+    """Return the segments of that name, in any case if none matches exactly, or that number."""
     found = [one for one in segments if one.name == label]
     found = found or [one for one in segments if one.name.lower() == label.lower()]
     return found or [one for one in segments if str(one.number) == label]
@@ -163,7 +169,7 @@ def _box_of(found: Volume, name: str, one: Segment) -> Box:
 
 
 def _mask_in(box: Box, found: Volume, chosen: Sequence[Segment]) -> NDArray[np.bool_]:
-    """Where in a box any of the segments is."""
+    """Return the voxels of a box that lie in any of the segments."""
     return reduce(np.logical_or, (found.values[one.layer][box] == one.value for one in chosen))
 
 
@@ -181,14 +187,20 @@ def _numbered(
 
 
 def _read(chosen: Sequence[Segment], mask: NDArray[np.bool_], ml: float) -> str:
-    """Which labels were read, and their volume; ml : of a voxel."""
+    """Return a text with the labels that were read and their volume.
+
+    ml : volume of a voxel
+    """
     return f"label {' + '.join(map(str, chosen))}, {in_ml(ml * np.count_nonzero(mask))}"
 
 
 def _require_whole(
     name: str, read: str, chosen: Sequence[Segment], holes: dict[str, float]
 ) -> None:
-    """SurfaceError of an organ with holes that other labels fill; holes : their volumes [ml]"""
+    """Raise SurfaceError if other labels fill holes of the organ.
+
+    holes : their volumes [ml]
+    """
     if holes:
         cut = ", ".join(f"label {one} ({in_ml(volume)})" for one, volume in holes.items())
         every = quote(",".join([*(one.name for one in chosen), *holes]))
@@ -207,7 +219,7 @@ def _surface_of_mask(inside: NDArray[np.bool_], affine: FloatArray, corner: IntA
     The blur draws round surfaces in: at a level of one half, a ball of 5 mm would lose a fifth of
     its volume. The level is the one at which the surface holds the volume of the mask.
 
-    corner : index of its first voxel in the map
+    corner : index of the mask's first voxel in the map
     """
     from scipy.ndimage import gaussian_filter
 

@@ -18,9 +18,9 @@ Box = tuple[slice, slice, slice]
 
 _ENCLOSED = 0.5  # of the surface of a part, from which on the organ encloses it
 _CAVITY = 1.0  # the smallest that is said [ml]
-# An image cropped to the organ, as DICOM leaves out empty slices, touches round ends, whose
-# outermost slice has 0.33 of the area of the next one. A cut end has more than 0.6; and a part of
-# the largest section, more where both ends touch, as then the image was cropped.
+# DICOM leaves out empty slices, so a cropped image touches round ends. Their outermost slice has
+# 0.33 of the area of the next one; a cut end has more than 0.6. A cut end also has a part of the
+# largest section, and more where both ends touch, as then the image was cropped.
 _BLUNT, _WIDE, _WIDE_OF_CROPPED = 0.6, 0.05, 0.2
 _SIDES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))
 
@@ -45,22 +45,27 @@ def around(boxes: Sequence[Box]) -> Box:
 
 
 def cavities(organ: Mask) -> tuple[IntArray, int]:
-    """Number of the cavity of each voxel, 0 in none, shape (nx, ny, nz); and how many there are."""
+    """Return the cavity number of each voxel, shape (nx, ny, nz), and how many cavities there are.
+
+    The number is 0 outside cavities.
+    """
     number, n = components(~organ)
     number[number == number[0, 0, 0]] = 0
     return number, n
 
 
 def filled(organ: Mask, part: Mask) -> tuple[Mask, float]:
-    """Return the organ with what its mask leaves out for a part of it, such as a lesion.
+    """Return the organ filled where its mask leaves out a part, for example a lesion.
 
-    A piece of the part belongs to the organ if the organ touches half of its surface, as it does
-    where a lesion was cut out of the organ's label, and with the rest of a cavity half full of it.
+    A piece of the part belongs to the organ if the organ touches half of its surface. That holds
+    where a lesion was cut out of the organ's label. If the part fills half of a cavity, the rest of
+    the cavity is filled too.
 
     Returns
     -------
     organ : Mask
-    share : fraction of the part that lies in this organ
+    share : float
+        Fraction of the part that lies in this organ.
     """
     cavity, n = cavities(organ)
     in_part, whole = (np.bincount(one.ravel(), minlength=n + 1) for one in (cavity[part], cavity))
@@ -71,7 +76,7 @@ def filled(organ: Mask, part: Mask) -> tuple[Mask, float]:
 
 
 def _belonging(some: IntArray, every: IntArray) -> Mask:
-    """Return whether some are half of all, by number; number 0 does not belong."""
+    """Return whether each count is at least half of the whole, by number; 0 does not belong."""
     return (some >= _ENCLOSED * every) & (np.arange(len(every)) > 0)
 
 
@@ -82,14 +87,19 @@ def left_out(
 
     Parameters
     ----------
-    cavity : as of :func:`cavities`
-    layers : names of labels, and the number of that of each voxel, from 1 on, 0 without one
-    ml : volume of a voxel
+    cavity : ndarray of int
+        See :func:`cavities`.
+    layers : Iterable
+        Names of labels, and the number of each voxel's label: 0 for none, 1 for the first name.
+    ml : float
+        Volume of a voxel [ml].
 
     Returns
     -------
-    enclosed : volumes [ml] of labels that fill holes of the organ, by their names
-    notices : of labels that the organ encloses in part, and of cavities
+    enclosed : dict[str, float]
+        Volumes [ml] of labels that fill holes of the organ, by name.
+    notices : list[str]
+        Labels that the organ encloses in part, and cavities.
     """
     is_hollow = cavity > 0
     enclosed: dict[str, float] = {}
@@ -120,9 +130,10 @@ def left_out(
 
 
 def cut_off(organ: Mask, shape: Sequence[int], box: Box, affine: FloatArray) -> list[str]:
-    """Return the notices of ends of the organ at the border of its image.
+    """Return notices of ends of the organ at the border of its image.
 
-    shape, affine : of the image, to RAS [mm]; box : of the organ's mask without its border
+    shape, affine : of the image, to RAS [mm]
+    box : box of the organ's mask without its border
     """
     inner = organ[1:-1, 1:-1, 1:-1]
     notices = []
@@ -151,7 +162,7 @@ def in_ml(volume: float) -> str:
 
 
 def _faces(piece: NDArray[np.integer], organ: Mask, n: int) -> tuple[IntArray, IntArray]:
-    """Faces of voxels between each of n pieces and the organ, and of its surface; by its number."""
+    """Return how many voxel faces each of n pieces has on the organ, and in all."""
     touching, surface = np.zeros(n, np.int64), np.zeros(n, np.int64)
     for axis in range(3):
         pieces, organs = (np.moveaxis(of, axis, 0) for of in (piece, organ))

@@ -33,16 +33,16 @@ TILT = 10.0  # rotations tried: 24 turns of the axes, each tilted by this about 
 
 @dataclass(frozen=True)
 class GridBox:
-    """Where the points of a regular grid lie: shared by all organs of a base.
+    """Box with the points of a regular grid; all organs of a base use the same box.
 
     Attributes
     ----------
     origin : tuple[float, float, float]
         Lowest corner [m].
     spacing : float
-        The same along x, y, z [m].
+        Distance of neighbouring points, the same along x, y, z [m].
     shape : tuple[int, int, int]
-        Points (nx, ny, nz).
+        Numbers of points (nx, ny, nz).
     """
 
     origin: tuple[float, float, float]
@@ -60,7 +60,7 @@ class GridBox:
         return grid_points(np.array(self.origin), self.spacing, self.shape)
 
     def margin(self, surface: SurfaceMesh) -> float:
-        """Least gap between the surface and the sides of the box, negative if it sticks out [m]."""
+        """Return the least gap from surface to box, negative if the surface sticks out [m]."""
         low, high = surface.bounding_box
         return float(min((low - self.origin).min(), (self.upper - high).min()))
 
@@ -76,7 +76,7 @@ class DistanceGrid:
     spacing : float
         Distance of neighbouring grid points, the same along x, y, z [m].
     values : ndarray, shape (nx, ny, nz)
-        Values [m].
+        Signed distances [m].
     """
 
     origin: FloatArray
@@ -85,7 +85,7 @@ class DistanceGrid:
 
     @property
     def box(self) -> GridBox:
-        """Where the grid lies."""
+        """Box of the grid's points."""
         x, y, z = (float(value) for value in self.origin)
         nx, ny, nz = self.values.shape
         return GridBox((x, y, z), self.spacing, (nx, ny, nz))
@@ -106,9 +106,9 @@ class DistanceGrid:
         return float(self.spacing**3 * inside.sum())
 
     def sample(self, points: FloatArray) -> FloatArray:
-        """Trilinear interpolation at points, shape (k, 3) [m]; beyond the grid its nearest value.
+        """Return trilinear interpolation at points (k, 3) [m], beyond the grid its nearest value.
 
-        Returns ndarray, shape (k,) [m].
+        The result has shape (k,) [m].
         """
         index = (np.asarray(points) - self.origin).T / self.spacing
         return map_coordinates(self.values, index, order=1, mode="nearest")
@@ -116,12 +116,12 @@ class DistanceGrid:
 
 @dataclass(frozen=True, eq=False)
 class OrientationOffset:
-    """The rotation, among 24 turns of the axes and small tilts, that best fits a reference.
+    """Rotation, among 24 turns of the axes and small tilts, that best fits a reference.
 
     Attributes
     ----------
     rotation : ndarray, shape (3, 3)
-        Turns the surface onto the reference.
+        Matrix that turns the surface onto the reference.
     angle : float
         Angle of that rotation [degrees].
     gain : float
@@ -160,26 +160,23 @@ def padded_box(surfaces: Sequence[SurfaceMesh], spacing: float, padding: float) 
 def distance_grid(
     surface: SurfaceMesh, spacing: float, padding: float, band: float | None = None
 ) -> DistanceGrid:
-    """Return signed distance on a grid that reaches padding [m] beyond the surface on every side.
+    """Return signed distances on a grid that reaches padding [m] beyond the surface on every side.
 
-    Parameters
-    ----------
-    band : float or None
-        See `distance_in_box`.
+    band : see `distance_in_box`
     """
     return distance_in_box(surface, padded_box([surface], spacing, padding), band)
 
 
 def distance_in_box(surface: SurfaceMesh, box: GridBox, band: float | None = None) -> DistanceGrid:
-    """Return the signed distance at the points of a box; what sticks out of the box is cut off.
+    """Return signed distances at the points of a box; surface parts outside the box are cut off.
 
     Raises SurfaceError if the band is narrower than two spacings: less spoils the isosurface.
 
     Parameters
     ----------
     band : float or None
-        Distances are cut to [-band, band] and computed only there, for fine grids [m]; a hierarchy
-        of coarser grids excludes the points that are farther away.
+        For fine grids: distances are computed only within [-band, band], and cut there [m]. A
+        hierarchy of coarser grids excludes the points that are farther away.
     """
     origin = np.array(box.origin)
     if band is None:
@@ -197,10 +194,10 @@ def distance_in_box(surface: SurfaceMesh, box: GridBox, band: float | None = Non
 def _band_values(
     surface: SurfaceMesh, origin: FloatArray, spacing: float, shape: IntArray, band: float
 ) -> FloatArray:
-    """Distance cut to the band, evaluated only where a coarser grid does not exclude the band.
+    """Return the distance cut to the band, evaluated only where a coarser grid does not exclude it.
 
-    A distance is 1-Lipschitz: a point at r from a coarse point with |phi| >= band + r has the
-    same sign and lies beyond the band.
+    A distance is 1-Lipschitz. If |phi| >= band + r at a coarse point, every point within r of it
+    has the same sign and lies beyond the band.
     """
     if min(shape) < COARSEST:
         values = surface.skin.signed_distance(grid_points(origin, spacing, shape.tolist()))
@@ -218,10 +215,10 @@ def _band_values(
 
 
 def reinitialize(grid: DistanceGrid) -> DistanceGrid:
-    """Signed distance to the zero surface of any level set: |grad phi| = 1, zero surface kept.
+    """Return the signed distance to the zero surface of any level set: |grad phi| = 1.
 
     Blended distances are no distances (|grad| 0.8 to 1.26 between livers). The magnitude is the
-    exact distance to the marching-cubes surface, the sign that of the given values.
+    exact distance to the marching-cubes surface. The sign is taken from the given values.
 
     Raises SurfaceError if the grid has no zero surface.
     """
@@ -250,9 +247,9 @@ def dice(one: DistanceGrid, other: DistanceGrid) -> float:
 
 
 def isosurface(grid: DistanceGrid, name: str = "isosurface") -> SurfaceMesh:
-    """Return zero surface of the grid by marching cubes, faces outward, closed along the border.
+    """Return the zero surface of a grid by marching cubes, with outward faces.
 
-    What is inside at the border of the grid is cut off there.
+    The surface is closed along the grid's border, where the organ is cut off.
 
     Raises SurfaceError if the grid has no zero surface.
     """
@@ -263,7 +260,7 @@ def isosurface(grid: DistanceGrid, name: str = "isosurface") -> SurfaceMesh:
 
 
 def _in_space(grid: DistanceGrid, index: FloatArray, faces: IntArray, name: str) -> SurfaceMesh:
-    """Return a marched surface from index coordinates to metres."""
+    """Return a marched surface in metres from index coordinates."""
     if len(faces) == 0:
         raise SurfaceError(
             f"{name}: nothing of the organ lies in the grid; move the box onto it, or choose a "
@@ -284,9 +281,10 @@ def grid_points(origin: FloatArray, spacing: float, shape: Sequence[int]) -> Flo
 def orientation_offset(surface: SurfaceMesh, reference: SurfaceMesh) -> OrientationOffset:
     """Return the rotation R that brings the surface closest to the reference (the phantom).
 
-    min over R of the mean of |phi_surface(R^T x) - phi_reference(x)|^2 over a ball, both surfaces
-    centred, scaled to 1.5 litres, phi cut to [-30, 10] mm. R runs over the 24 turns of the axes,
-    each alone and tilted by 10 degrees: what a wrong `--axes` can do, not a registration.
+    R minimizes the mean of |phi_surface(R^T x) - phi_reference(x)|^2 over a ball. Both surfaces are
+    centred and scaled to 1.5 litres; phi is cut to [-30, 10] mm. R runs over the 24 turns of the
+    axes, each alone and tilted by 10 degrees. This covers the effects of a wrong `--axes`; it is no
+    registration.
     """
     grid, target = _compared(surface), _compared(reference)
     in_ball = np.linalg.norm(target.points, axis=1) <= COMPARED_HALF_WIDTH
@@ -302,14 +300,14 @@ def orientation_offset(surface: SurfaceMesh, reference: SurfaceMesh) -> Orientat
 
 
 def candidate_rotations() -> FloatArray:
-    """The 24 rotations that permute the axes, each alone and under six tilts; (168, 3, 3)."""
+    """Return the 24 permutations of the axes, each alone and under six tilts; (168, 3, 3)."""
     tilts = np.vstack([np.zeros(3), np.eye(3), -np.eye(3)]) * np.radians(TILT)
     turned = Rotation.create_group("O").as_matrix()
     return np.array([t @ r for t, r in product(Rotation.from_rotvec(tilts).as_matrix(), turned)])
 
 
 def _compared(surface: SurfaceMesh) -> DistanceGrid:
-    """Cut distance of the surface, centred and scaled to 1.5 litres, on the common cube."""
+    """Return the cut distance, centred and scaled to 1.5 litres, on the common cube."""
     spacing = float(surface.extent.max()) / 20
     coarse = distance_grid(surface, spacing, padding=spacing)
     inside = coarse.values.ravel() < 0

@@ -1,8 +1,8 @@
-"""Tetrahedral meshes of an organ, and the regions where it is held and where a tool may touch it.
+"""Tetrahedral meshes of an organ, with the regions where it is held and where a tool may touch it.
 
-``surface -> tetrahedralize -> TetMesh``; the boundary of a ``TetMesh`` carries two regions, the
-clamp and the accessible surface, found by a geometric rule here, or read from a file of node groups
-(:mod:`avatar_core.geometry.groups`).
+``surface -> tetrahedralize -> TetMesh``. The boundary of a ``TetMesh`` carries two regions, the
+clamp and the accessible surface. A geometric rule finds them here, or a file of node groups gives
+them (:mod:`avatar_core.geometry.groups`).
 """
 
 from __future__ import annotations
@@ -41,9 +41,10 @@ class TetMesh:
     vertices : ndarray, shape (n_vertices, 3)
         Vertices [m].
     tets : ndarray of int, shape (n_tets, 4)
-    pairs : ndarray of int, shape (n_pairs, 2)
-        Vertices of the two sides of a cut that lie at one place; None for a whole organ. Faces
-        between the sides are no boundary.
+        Corners of each element.
+    pairs : ndarray of int, shape (n_pairs, 2), or None
+        Coinciding vertices of the two sides of a cut; None for a whole organ. Faces between the
+        sides do not belong to the boundary.
     """
 
     vertices: np.ndarray
@@ -63,17 +64,17 @@ class TetMesh:
 
     @property
     def boundary_tets(self) -> np.ndarray:
-        """The element that each boundary triangle is a face of, shape (n_faces,)."""
+        """Element of each boundary triangle, shape (n_faces,)."""
         return self._boundary // 4
 
     @cached_property
     def _boundary(self) -> np.ndarray:
-        """4 element + face of those that no other element has, ascending."""
+        """Codes 4 element + face of the faces that only one element has, ascending."""
         return _single_faces(self.joined[self.tets])
 
     @cached_property
     def joined(self) -> np.ndarray:
-        """Number of each vertex in the whole organ, where pairs are one, shape (n_vertices,)."""
+        """Number of each vertex in the whole organ, where pairs are merged, shape (n_vertices,)."""
         number = np.arange(len(self.vertices))
         if self.pairs is not None:
             number[self.pairs[:, 1]] = self.pairs[:, 0]
@@ -81,7 +82,7 @@ class TetMesh:
 
     @cached_property
     def is_second_side(self) -> np.ndarray:
-        """Which elements lie on the second side of the cut, shape (n_tets,)."""
+        """Mask of elements on the second side of the cut, shape (n_tets,)."""
         if self.pairs is None:
             return np.zeros(len(self.tets), bool)
         second = np.isin(self.tets, self.pairs[:, 1]).any(axis=1)
@@ -159,14 +160,14 @@ class TetMesh:
 
 @dataclass(frozen=True)
 class Regions:
-    """Where the organ is held and where a tool may touch it.
+    """Masks of the boundary faces where the organ is held and where a tool may touch it.
 
     Attributes
     ----------
     clamped : ndarray of bool, shape (n_faces,)
-        Over ``TetMesh.boundary_faces``.
+        Clamped faces among ``TetMesh.boundary_faces``.
     accessible : ndarray of bool, shape (n_faces,)
-        Disjoint from the clamp's neighbourhood.
+        Accessible faces, disjoint from the clamp's neighbourhood.
     """
 
     clamped: np.ndarray
@@ -198,7 +199,7 @@ def make_mesh(vertices: np.ndarray, tets: np.ndarray) -> TetMesh:
     Raises
     ------
     MeshError
-        For no elements, coordinates that are not finite, or elements of no volume.
+        If there are no elements, coordinates are not finite, or an element has no volume.
     """
     vertices, tets = np.asarray(vertices, float), np.asarray(tets, np.int64)
     if len(tets) == 0:
@@ -228,16 +229,16 @@ def tetrahedralize(surface: SurfaceMesh, n_vertices: int = 2850) -> TetMesh:
     The same surface gives the same mesh, bit for bit, and the mesh holds its volume.
 
     fTetWild accepts cracked, doubled and self-intersecting faces (Hu et al., "Fast Tetrahedral
-    Meshing in the Wild", 2020). Of the box that it fills, the tetrahedra are kept whose centroids
-    the winding number of the surface calls inside; its own filter loses a lobe of a folded liver
-    now and then.
+    Meshing in the Wild", 2020). It fills a box; tetrahedra are kept if the winding number of the
+    surface at their centroid says inside. fTetWild's own filter sometimes loses a lobe of a folded
+    liver.
 
     Parameters
     ----------
     surface : SurfaceMesh
     n_vertices : int
-        Number of mesh vertices aimed at; met to about 10 %, or the fewest that the surface allows:
-        600 to 2,000.
+        Number of mesh vertices aimed at, met to about 10 %. The least that a surface allows is 600
+        to 2,000.
 
     Raises
     ------
@@ -269,7 +270,7 @@ def tetrahedralize(surface: SurfaceMesh, n_vertices: int = 2850) -> TetMesh:
 def _filled_out(mesh: TetMesh, surface: SurfaceMesh) -> TetMesh:
     """Return the mesh with its boundary moved along its normals by the mean gap to the surface.
 
-    Facets between points of a round surface cut corners: of a liver they lack half a per cent.
+    Facets between points of a round surface cut corners: for a liver they lack half a per cent.
     """
     faces, area = mesh.boundary_faces, mesh.face_areas
     points = np.einsum("qk,fkd->fqd", IN_FACE, mesh.vertices[faces]).reshape(-1, 3)
@@ -281,10 +282,10 @@ def _filled_out(mesh: TetMesh, surface: SurfaceMesh) -> TetMesh:
 
 
 def _edge(volume: float, n_vertices: int, coarse: float) -> float:
-    """The edge h [m] of a mesh with about n vertices: n = n_0 + ``_FINE`` V (``_EDGE`` / h)^3.
+    """Return the edge h [m] for about n vertices: n = n_0 + ``_FINE`` V (``_EDGE`` / h)^3.
 
-    n_0 = ``coarse`` are those that the envelope takes, however long the edge. Of seven surfaces
-    with 600 to 25,000 vertices, it is off by 15 % at most; n_0 is known after one try.
+    The envelope takes n_0 = ``coarse`` vertices, however long the edge is. Over seven surfaces with
+    600 to 25,000 vertices, the formula is off by 15 % at most; n_0 is known after one try.
     """
     fine = max(n_vertices - coarse, _LEAST_FINE * n_vertices)
     return float(_EDGE * (volume * _FINE / fine) ** (1.0 / 3.0))
@@ -310,7 +311,7 @@ def _fill(surface: SurfaceMesh, edge: float) -> TetMesh:
 
 
 def _single_faces(tets: np.ndarray) -> np.ndarray:
-    """Return 4 element + face of the faces that one element alone has, ascending."""
+    """Return codes 4 element + face of the faces that only one element has, ascending."""
     faces = np.sort(tets[:, _TET_FACES].reshape(-1, 3), axis=1)
     _, first, count = np.unique(faces, axis=0, return_index=True, return_counts=True)
     return np.sort(first[count == 1])
@@ -343,12 +344,12 @@ def _components(sides: np.ndarray) -> np.ndarray:
 def regions_by_rule(
     mesh: TetMesh, clamp_fraction: float = 0.13, anterior_cosine: float = 0.2
 ) -> Regions:
-    """Clamp the posterior-superior cap, open the anterior surface to the tool.
+    """Clamp the posterior-superior cap and open the anterior surface to the tool.
 
-    The bare area and the caval groove hold a liver from behind and above: the boundary faces
+    The bare area and the caval groove hold a liver from behind and above. The boundary faces
     farthest in the direction (0, -1, 1)/sqrt(2) (RAS axes) are clamped until they hold
-    ``clamp_fraction`` of the area. Faces whose normal has at least ``anterior_cosine`` along +y
-    are accessible, without those that touch the clamp and without islands below 5 % of them.
+    ``clamp_fraction`` of the area. Faces whose normal has at least ``anterior_cosine`` along +y are
+    accessible. Faces that touch the clamp, and islands below 5 % of the area, are left out.
     """
     faces, area = mesh.boundary_faces, mesh.face_areas
     height = mesh.vertices[faces].mean(axis=1) @ POSTERIOR_SUPERIOR
@@ -370,7 +371,7 @@ def accessible_by_rule(
 
 
 def touching(mesh: TetMesh, chosen: np.ndarray) -> np.ndarray:
-    """Boundary faces that share a vertex with chosen ones, these among them, shape (n_faces,)."""
+    """Return boundary faces with a vertex on the chosen ones, these included, shape (n_faces,)."""
     faces = mesh.boundary_faces
     return np.asarray(np.isin(faces, faces[chosen]).any(axis=1))
 

@@ -1,11 +1,11 @@
 """Offsets of points from the closest points of a surface, interpolated on a grid.
 
-q - c(q), c(q) the closest point of the surface, is continuous around it, vanishes linearly through
-it, and is linear in q over each plane triangle. It is found exactly at the grid points of the cells
-that are asked for, once, and is trilinear between them: millions of points cost what the grid
-points in a thin layer around the surface do. Between the points that are closest to several places
-the interpolation is off by up to the distance between these; elsewhere, on livers with edges of 5
-mm, by hundredths of a millimetre.
+The offset is q - c(q), with c(q) the closest point of the surface. It is continuous around the
+surface, vanishes linearly through it, and is linear in q over each plane triangle. It is computed
+exactly and once, at the grid points of the cells that are asked for, and is trilinear between them.
+Millions of points therefore cost as much as the grid points in a thin layer around the surface. The
+interpolation fails between points whose closest places differ, by up to the distance between these
+places. Elsewhere, on livers with edges of 5 mm, it is off by hundredths of a millimetre.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def exact_offsets(surface: Soup, points: np.ndarray) -> np.ndarray:
 
 
 class OffsetGrid:
-    """The same between grid points around a surface [m]."""
+    """Offsets from a surface, interpolated between grid points around it [m]."""
 
     def __init__(self, surface: Soup, spacing: float = SPACING) -> None:
         self._surface, self._spacing = surface, spacing
@@ -41,7 +41,7 @@ class OffsetGrid:
         self._known = np.zeros(shape, bool)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Offsets of some points, both (n, 3) [m]."""
+        """Return offsets of some points, both (n, 3) [m]."""
         place = (points - self._origin) / self._spacing
         index = np.empty((8 * len(place), 3), np.int32)
         new = index[: _take_unknown(place, self._known, index)]
@@ -55,14 +55,14 @@ class OffsetGrid:
 
 @compiled()
 def _cell(x, count):  # type: ignore[no-untyped-def]
-    """First point of the cell that holds x along an axis of ``count`` points, and x within it."""
+    """Return the first point of the cell of x along an axis of ``count`` points, and x within."""
     low = min(max(int(np.floor(x)), 0), count - 2)
     return low, min(max(x - low, 0.0), 1.0)
 
 
 @compiled()
 def _take_unknown(place, known, index):  # type: ignore[no-untyped-def]
-    """Number of corners, of the cells of points (n, 3) [spacings], that were not known.
+    """Return how many corners of the cells of points (n, 3) [spacings] were not known.
 
     They are written to ``index`` and become known.
     """
@@ -84,7 +84,7 @@ def _take_unknown(place, known, index):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _interpolate(values, place, out):  # type: ignore[no-untyped-def]
-    """Trilinear ``values``, (nx, ny, nz, 3), at points, (n, 3) [spacings]."""
+    """Interpolate ``values``, (nx, ny, nz, 3), trilinearly at points, (n, 3) [spacings]."""
     nx, ny, nz = values.shape[:3]
     for row in range(len(place)):
         i, u = _cell(place[row, 0], nx)

@@ -1,8 +1,8 @@
-"""The built-in liver, a smooth level set of two lobes, a notch and a flat visceral face, and the
-maps that turn one organ into a population.
+"""The built-in liver, and the maps that turn one organ into a population.
 
-Axes RAS, metres: the right lobe lies at +x, the left lobe tapers to -x, the dome is superior (+z)
-and the visceral face looks down, back and to the left.
+The liver is a smooth level set of two lobes, a notch and a flat visceral face. Axes are RAS, in
+metres. The right lobe lies at +x, the left lobe tapers to -x, and the dome is superior (+z). The
+visceral face looks down, back and to the left.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ class Ellipsoid:
     radii: Vector
 
     def __call__(self, points: FloatArray) -> FloatArray:
+        """Return the distance of points, shape (k,) [m]."""
         scaled = (points - self.centre) / np.array(self.radii)
         k0 = np.linalg.norm(scaled, axis=1)
         k1 = np.maximum(np.linalg.norm(scaled / np.array(self.radii), axis=1), 1e-9)
@@ -71,7 +72,7 @@ def phantom_liver(spacing: float = 7e-3) -> SurfaceMesh:
 
 
 def liver_level_set(points: FloatArray) -> FloatArray:
-    """Return smooth function, negative inside the phantom, nearly its distance; shape (k,) [m]."""
+    """Return a smooth level set, negative inside the phantom, near its distance; shape (k,) [m]."""
     lobes = smooth_union(RIGHT_LOBE(points), LEFT_LOBE(points), width=0.030)
     visceral = half_space(points, VISCERAL_POINT, VISCERAL_NORMAL)
     body = -smooth_union(-lobes, -visceral, width=0.025)
@@ -95,7 +96,8 @@ def relax(
 ) -> FloatArray:
     """Even out a triangulation of a level set: neighbour averages, put back on the zero surface.
 
-    vertices : ndarray, shape (n, 3) [m]; faces : ndarray, shape (m, 3)
+    vertices : ndarray, shape (n, 3) [m]
+    faces : ndarray, shape (m, 3)
     """
     edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     valence = np.bincount(edges[:, 0], minlength=len(vertices))[:, None]
@@ -107,7 +109,7 @@ def relax(
 
 
 def project(points: FloatArray, level_set: LevelSet, step: float = 1e-5) -> FloatArray:
-    """Newton step to the zero surface, x - f grad f / |grad f|^2, twice; shape (k, 3) [m]."""
+    """Take Newton steps to the zero surface, x - f grad f / |grad f|^2, twice; shape (k, 3) [m]."""
     for _ in range(2):
         offsets = step * np.eye(3)
         slopes = [(level_set(points + d) - level_set(points - d)) / (2 * step) for d in offsets]
@@ -131,8 +133,9 @@ class ShapeMap:
     shear : ndarray, shape (3,)
         Entries xy, xz, yz of A above the diagonal; below it are zeros.
     bend : ndarray, shape (6,)
-        Amplitudes [m] of b_i(x) = a (1 - cos(2 pi x_j / L)) for the pairs (i, j) of axes: smooth,
-        not affine, one-to-one if the two of each i together stay below L / (2 pi).
+        Amplitudes [m] of b_i(x) = a (1 - cos(2 pi x_j / L)) for the pairs (i, j) of axes. The map
+        is smooth and not affine. It is one-to-one if the two amplitudes of each i together stay
+        below L / (2 pi).
     """
 
     stretch: FloatArray
@@ -141,13 +144,13 @@ class ShapeMap:
 
     @property
     def matrix(self) -> FloatArray:
-        """A, upper triangular, shape (3, 3)."""
+        """Matrix A, upper triangular, shape (3, 3)."""
         matrix = np.diag(self.stretch)
         matrix[np.triu_indices(3, 1)] = self.shear
         return matrix
 
     def __call__(self, points: FloatArray) -> FloatArray:
-        """Images of points, shape (k, 3) [m]."""
+        """Return the images of points, shape (k, 3) [m]."""
         bent = np.array(points, dtype=np.float64)
         for (i, j), amplitude in zip(BENT, self.bend, strict=True):
             bent[:, i] += amplitude * (1.0 - np.cos(2 * np.pi / BEND_LENGTH * points[:, j]))
@@ -161,8 +164,8 @@ class ShapeMap:
 def population(n: int, seed: int, bend: float = 0.0) -> list[ShapeMap]:
     """Return random maps of Eq. 17 (six parameters, if bend > 0 twelve); longer lists begin alike.
 
-    Stretches 1.3^(u / 3) and shears 0.1 u, u uniform in [-1, 1]: the volume changes by det A,
-    always under 30 %, the distortion is always under 10 %. (The paper prints the sum of the
+    Stretches are 1.3^(u / 3) and shears 0.1 u, with u uniform in [-1, 1]. The volume changes by det
+    A, always under 30 %; the distortion is always under 10 %. (The paper prints the sum of the
     stretches for the volume gain; it is their product.)
 
     Raises SurfaceError if the bends could fold the organ.

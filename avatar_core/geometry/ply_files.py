@@ -1,9 +1,9 @@
 """PLY files, ASCII and binary of both byte orders: vertices and faces among any other elements.
 
-A header names elements, such as ``vertex``, ``face`` or PCL's ``camera``, with their counts and
-their properties in any order: numbers, or lists behind their lengths. An ASCII file is read as a
-binary one of double precision. What a count claims is compared with what the file holds before
-memory is allocated for it.
+A header names elements, e.g. ``vertex``, ``face`` or PCL's ``camera``, with their counts. It lists
+their properties in any order: numbers, or lists preceded by their lengths. An ASCII file is read
+like a binary file of double precision. Counts are compared with the file's size before memory is
+allocated.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _HEAD = re.compile(rb"ply[ \t]*(\r\n|\n|\r)")
 
 @dataclass(frozen=True)
 class _Property:
-    """A number, or a list of them behind its length, whose type is ``count``."""
+    """A number, or a list of numbers after its length, whose type is ``count``."""
 
     name: str
     kind: np.dtype[Any]
@@ -59,7 +59,7 @@ def read_ply(content: bytes) -> Soup:
     Raises
     ------
     ValueError
-        The file is no such file, ends too early, or contradicts itself.
+        If the file is no PLY file, ends too early, or contradicts itself.
     """
     elements, body = _parts(content)
     points: FloatArray = np.empty((0, 3))
@@ -134,7 +134,7 @@ def _property(words: list[str], order: str, is_text: bool) -> _Property:
 def _rows(element: _Element, body: bytes, at: int) -> tuple[dict[str, NDArray[Any] | Cells], int]:
     """Return the columns of an element that begins at a place in the body, and where it ends.
 
-    A column is an array (n,) of numbers, or of lists where each begins and their corners.
+    A column is an array (n,) of numbers, or cells: where each list begins, and the corners.
     """
     if not element.n or not element.properties:
         return {}, at
@@ -157,7 +157,7 @@ def _rows(element: _Element, body: bytes, at: int) -> tuple[dict[str, NDArray[An
 
 
 def _row(element: _Element, body: bytes, at: int) -> tuple[list[NDArray[Any]], int]:
-    """The numbers of each property in the row that begins at a place, and where the row ends."""
+    """Return the numbers of each property in the row at a place, and where the row ends."""
     found = []
     for one in element.properties:
         n = 1
@@ -176,7 +176,7 @@ def _numbers(body: bytes, kind: np.dtype[Any], n: int, at: int) -> NDArray[Any]:
 
 
 def _named(element: _Element, columns: list[Any]) -> dict[str, NDArray[Any] | Cells]:
-    """Return the columns by name, of the rows' numbers of each property."""
+    """Return the columns by name, from the numbers of each property."""
     named: dict[str, NDArray[Any] | Cells] = {}
     for one, rows in zip(element.properties, columns, strict=True):
         if one.count is None:

@@ -1,4 +1,4 @@
-"""Where points lie in a mesh: in which tetrahedron, or nearest to which triangle."""
+"""Location of points in a mesh: their tetrahedron, or the nearest triangle."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ _SLACK = 1e-9  # barycentric coordinates down to minus this count as inside
 def carriers(mesh: TetMesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
     """Return the vertices of a mesh between which a field is interpolated linearly at points.
 
-    Points in a tetrahedron take its barycentric coordinates, points outside those of the closest
-    point of the surface, which has three corners: the last has no weight.
+    A point in a tetrahedron takes its barycentric coordinates. A point outside takes the
+    coordinates of the closest surface point, which has three corners: the last corner has weight
+    zero.
 
     Returns
     -------
@@ -38,8 +39,10 @@ def locate(mesh: TetMesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
 
     Returns
     -------
-    tet : ndarray of int, shape (n,), -1 outside
-    barycentric : ndarray, shape (n, 4), rows sum to one; zero outside
+    tet : ndarray of int, shape (n,)
+        Tetrahedron of each point, -1 outside.
+    barycentric : ndarray, shape (n, 4)
+        Coordinates, whose rows sum to one; zero outside.
     """
     corners = mesh.vertices[mesh.tets]
     center = corners.mean(axis=1)
@@ -67,11 +70,11 @@ def closest_points(
     Returns
     -------
     nearest : ndarray, shape (n, 3)
-        Nearest [m].
+        Closest points [m].
     face : ndarray of int, shape (n,)
-        The faces they lie on.
+        Faces of the closest points.
     barycentric : ndarray, shape (n, 3)
-        Their coordinates there, rows sum to one.
+        Barycentric coordinates in these faces, rows sum to one.
     """
     faces = faces.astype(np.int64)
     if len(points) == 0:
@@ -85,7 +88,7 @@ def closest_points(
 
 
 def barycentric_centroids(n: int) -> FloatArray:
-    """Barycentric coordinates of the centroids of n^2 equal pieces of a triangle, (n^2, 3)."""
+    """Return barycentric centroids of n^2 equal pieces of a triangle, shape (n^2, 3)."""
     up = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
     down = [(i + 2 / 3, j + 2 / 3) for i in range(n) for j in range(n - 1 - i)]
     second = np.array(up + down) / n

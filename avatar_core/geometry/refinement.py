@@ -1,7 +1,7 @@
 """Tetrahedral meshes refined around points, and fitted there to the surface they came from.
 
-A contact is some millimetres wide, the elements of an organ some ten: what a reference solution
-needs is small elements around the contact alone, on the surface itself and not on its facets.
+A contact is some millimetres wide, the elements of an organ some ten. A reference solution needs
+small elements around the contact alone, on the surface itself and not on its facets.
 """
 
 from __future__ import annotations
@@ -31,19 +31,20 @@ _ROUNDS, _LESS, _AROUND = 15, 0.7, 2.0  # of taking back motion there: number, f
 class Grading:
     """Longest edges of a mesh around a round contact, over its axis.
 
-    h = max(core, inner min(rho, a)) + outer d at the distance rho from the axis, d being that from
-    the disc of radius a: the contact is resolved at every radius, and what lies below it less.
+    h = max(core, inner min(rho, a)) + outer d, with rho the distance from the axis and d the
+    distance from the disc of radius a. The contact is resolved at every radius, and the volume
+    below it less.
 
     Attributes
     ----------
     point : ndarray, shape (3,)
-        Point [m], the centre of the contact.
+        Centre of the contact [m].
     axis : ndarray, shape (3,)
-        Unit.
+        Unit vector along the axis.
     core : float
         h at the centre [m].
     radius : float
-        a, of the largest contact [m].
+        a, the radius of the largest contact [m].
     inner : float
         Growth of h over rho inside the disc.
     outer : float
@@ -72,7 +73,7 @@ def refine(
     """Bisect the longest edges of tetrahedra until none is longer than h at its centroid.
 
     The mesh stays conforming (Rivara, Int. J. Numer. Meth. Eng. 20:745, 1984; scikit-fem's
-    implementation), and its shape and regions as they are.
+    implementation). Its shape and regions do not change.
 
     Parameters
     ----------
@@ -82,7 +83,7 @@ def refine(
     gradings : Sequence[Grading]
         Gradings of each contact; the least h counts.
     most_vertices : int
-        Most vertices at which to give up.
+        Number of vertices above which refinement fails.
 
     Raises
     ------
@@ -114,7 +115,7 @@ def _longest_edges(corners: np.ndarray) -> np.ndarray:
 
 
 def _bisected(mesh: MeshTet, marked: np.ndarray) -> MeshTet:
-    """One bisection, without a seed of the global generator and without notes on memory layout."""
+    """Bisect once, without a seed of the global generator and without notes on memory layout."""
     state, level = np.random.get_state(), _SKFEM_LOG.level  # noqa: NPY002
     _SKFEM_LOG.setLevel(logging.ERROR)
     try:
@@ -142,16 +143,17 @@ def _inherited(coarse: TetMesh, regions: Regions, fine: TetMesh) -> Regions:
 def onto_surface(mesh: TetMesh, surface: SurfaceMesh, point: np.ndarray, radius: float) -> TetMesh:
     """Move the boundary within a radius of a point onto a surface, and the inside with it.
 
-    A boundary vertex at the distance r moves by w(r) (closest(x) - x), w = 1 below ``radius`` and
-    fading to 0 at 1.5 of it; the vertices inside by the harmonic extension, nothing elsewhere. At
-    sharp edges some move less, by up to ``_LEFT`` within the radius, where elements would turn.
+    A boundary vertex at the distance r moves by w(r) (closest(x) - x). The weight w is 1 below
+    ``radius`` and fades to 0 at 1.5 ``radius``. Vertices inside move by the harmonic extension. At
+    sharp edges, where elements would turn, vertices move less, by up to ``_LEFT`` within the
+    radius.
 
     Parameters
     ----------
     mesh : TetMesh
-        Fine against ``radius`` there.
+        Mesh whose elements near the point are small against ``radius``.
     surface : SurfaceMesh
-        Near the mesh's boundary.
+        Surface near the mesh's boundary.
     point : ndarray, shape (3,)
         Point [m].
     radius : float
@@ -203,19 +205,19 @@ def _beside(mesh: TetMesh, moved: np.ndarray, turned: np.ndarray) -> np.ndarray:
 
 
 def _fading(x: np.ndarray) -> np.ndarray:
-    """Return 1 up to 1, 0 from ``_FADE`` on, with a continuous slope between."""
+    """Return a weight that is 1 below x = 1 and fades to 0 at ``_FADE`` with continuous slope."""
     s = np.clip((_FADE - x) / (_FADE - 1.0), 0.0, 1.0)
     return np.asarray(s * s * (3.0 - 2.0 * s))
 
 
 @BilinearForm
 def _laplace(u, v, w):  # type: ignore[no-untyped-def]
-    """Stiffer where elements are small, which keeps their shape."""
+    """Return a Laplacian that is stiffer where elements are small, which keeps their shape."""
     return dot(grad(u), grad(v)) / w.h
 
 
 def _harmonic(mesh: TetMesh) -> Callable[[np.ndarray], np.ndarray]:
-    """Extends vectors at boundary vertices to all vertices, shape (n_vertices, 3)."""
+    """Return a function that extends boundary vectors to all vertices, shape (n_vertices, 3)."""
     matrix = _laplace.assemble(Basis(_skfem_mesh(mesh), ElementTetP1(), intorder=1)).tocsr()
     inside = np.setdiff1d(np.arange(len(mesh.vertices)), mesh.surface_vertices)
     factor = rslab.ldlt(sp.csc_matrix(matrix[inside][:, inside]), threads=1)

@@ -1,4 +1,4 @@
-"""A closed triangulated surface with about so many vertices as are wanted, for display."""
+"""Resampling of a closed triangulated surface to a wanted number of vertices, for display."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def require_displayable(n: int) -> None:
 def resampled(vertices: FloatArray, faces: IntArray, n: int) -> tuple[FloatArray, IntArray]:
     """Return a surface with about n vertices: subdivided by Loop's scheme, then edges collapsed.
 
-    Loop's limit surface is smooth (Loop, 1987); edges collapse in the order of the quadric error
-    (Garland & Heckbert, 1997). Both shrink a convex surface, so that its vertices are then moved
+    Loop's limit surface is smooth (Loop, 1987). Edges collapse in the order of the quadric error
+    (Garland & Heckbert, 1997). Both shrink a convex surface. Therefore its vertices are then moved
     along their normals by (V_before - V) / A, with volume V and area A. A surface that is no
     manifold has flat triangles split in four instead, and gets n vertices at least.
 
@@ -57,7 +57,7 @@ def resampled(vertices: FloatArray, faces: IntArray, n: int) -> tuple[FloatArray
 
 
 def unified(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """Return the triangles whose corners coincide, made to share them."""
+    """Return the triangles with coinciding corners merged."""
     index = weld(vertices)
     _, first = np.unique(index, return_index=True)
     shared = index[faces]
@@ -66,7 +66,7 @@ def unified(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray
 
 
 def is_manifold(faces: IntArray) -> bool:
-    """Return whether two triangles meet on every edge, and one fan of them at every vertex."""
+    """Return whether two triangles meet on every edge, and one fan of triangles at every vertex."""
     faces = np.ascontiguousarray(faces, np.int64)
     closed = len(igl.boundary_facets(faces)[0]) == 0
     return bool(closed and igl.is_edge_manifold(faces)[0] and igl.is_vertex_manifold(faces).all())

@@ -1,7 +1,7 @@
-"""The skin of a surface: the triangles that separate inside from outside, and nothing else.
+"""Skin of a surface: the triangles that separate inside from outside, and nothing else.
 
-A surface from a file may have holes, overlap itself or lie twice: its triangles then leave parts of
-the boundary of the solid open, or lie inside it. Distances are measured to the skin, so that they
+A surface from a file may have holes, overlap itself or exist twice. Its triangles then leave parts
+of the solid's boundary open, or lie inside it. Distances are measured to the skin, so that they
 vanish where the sign changes and nowhere else.
 """
 
@@ -35,9 +35,9 @@ class Skin:
     Attributes
     ----------
     covered : Soup
-        The surface and the cones over its holes, which decides what is inside.
+        The surface and the cones over its holes; the winding number on it decides what is inside.
     boundary : Soup
-        The triangles of it with inside on one side and outside on the other.
+        Triangles of ``covered`` with inside on one side and outside on the other.
     """
 
     covered: Soup
@@ -77,7 +77,10 @@ def skin_of(vertices: FloatArray, faces: NDArray[Any], name: str = "surface") ->
 
 
 def weld(vertices: FloatArray, tolerance: float = 1e-7) -> IntArray:
-    """Return the index of the merged vertex of each vertex, shape (n,); tolerance x diagonal."""
+    """Return the index of each vertex after merging, shape (n,).
+
+    tolerance : largest distance of merged vertices over the bounding box's diagonal
+    """
     cell = tolerance * float(np.linalg.norm(np.ptp(vertices, axis=0))) or 1.0
     key = np.round((vertices - vertices.min(axis=0)) / cell).astype(np.int64)
     return np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
@@ -99,11 +102,12 @@ def components(links: IntArray, n: int) -> IntArray:
 
 
 def _covers(vertices: FloatArray, faces: IntArray) -> Soup:
-    """Cones over the rims of all holes: apices, and triangles that name them after the vertices.
+    """Return cones over the rims of all holes: apices, and triangles.
 
-    A cone over the unpaired edges of a surface makes it a closed chain, whatever its shape. It
-    covers a hole if the winding number on it, off the surface, is neither that of inside nor of
-    outside. Cracks and flipped faces have unpaired edges too and are left alone.
+    Triangles number the apices after the vertices. A cone over the unpaired edges of a surface
+    makes it a closed chain, whatever its shape. The cone covers a hole if the winding number on it,
+    off the surface, is neither that of inside nor of outside. Cracks and flipped faces have
+    unpaired edges too and are left alone.
     """
     none = np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
     edge = float(igl.avg_edge_length(vertices, faces))
@@ -155,10 +159,11 @@ def _unpaired(triangles: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def _boundary(soup: Soup) -> Soup:
-    """The triangles with inside on one side only, those cut by others to an eighth of an edge.
+    """Return triangles with inside on one side only, resolved to an eighth of an edge at cuts.
 
-    Triangles at an intersection are quartered and tested again. Of the smallest, those on either
-    side of it are kept: the skin has no gaps, which a narrow band would jump through.
+    Triangles at an intersection are quartered and tested again. The smallest triangles on either
+    side of an intersection are kept. The skin then has no gaps, which a narrow band would jump
+    through.
     """
     merged, vertices = weld(soup[0]), soup[0]
     representative = np.empty(len(vertices), dtype=np.int64)
@@ -181,7 +186,7 @@ def _boundary(soup: Soup) -> Soup:
 
 
 def _quartered(vertices: FloatArray, faces: IntArray) -> Soup:
-    """Return every triangle split at the middles of its edges, which neighbours share.
+    """Return every triangle split at the middles of its edges, which are shared by neighbours.
 
     Own code because igl.upsample aborts the process where many faces meet at one edge.
     """
@@ -197,7 +202,7 @@ def _quartered(vertices: FloatArray, faces: IntArray) -> Soup:
 
 
 def _separates(soup: Soup, corners: FloatArray) -> NDArray[np.bool_]:
-    """Whether inside lies on one side of the middle of each triangle, outside on the other."""
+    """Return whether each triangle's middle has inside on one side and outside on the other."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     step = BESIDE * normal / np.sqrt(np.where(length > 0, length, 1.0))  # |normal| ~ edge^2

@@ -249,10 +249,10 @@ def require_plausible_size(surface: SurfaceMesh) -> None:
 
 
 def ambiguous_fraction(surface: SurfaceMesh) -> float:
-    """Return the points with 0.25 < |w| < 0.75 over points with |w| > 0.5, away from the surface.
+    """Return points with 0.25 < |w| < 0.75 over points with |w| > 0.5, away from the surface.
 
-    0 for a closed surface, cracked or not; above 0.12 for livers cut in half; inf if nothing is
-    inside.
+    The fraction is 0 for a closed surface, cracked or not, and above 0.12 for livers cut in half.
+    It is infinite if nothing is inside.
     """
     winding = np.abs(surface.clear_winding)
     n_inside = np.count_nonzero(winding > 0.5)
@@ -271,7 +271,10 @@ def winding_number(surface: SurfaceMesh, points: FloatArray) -> FloatArray:
 
 
 def _clear_winding(surface: SurfaceMesh, n: int = 24, band: float = 0.02) -> FloatArray:
-    """Winding number on an n^3 grid in the bounding box, off the surface by band x diagonal."""
+    """Return the winding number on an n^3 grid in the bounding box, away from the surface.
+
+    band : least distance from the surface over the diagonal
+    """
     points = box_points(*surface.bounding_box, (n, n, n))
     squared, _, _ = igl.point_mesh_squared_distance(points, surface.vertices, _int64(surface.faces))
     clear = squared > (band * np.linalg.norm(surface.extent)) ** 2
@@ -312,7 +315,7 @@ def _check_arrays(vertices: FloatArray, faces: NDArray[Any], name: str) -> None:
 
 
 def _patch_labels(vertices: FloatArray, faces: NDArray[np.int32]) -> IntArray:
-    """Component of each face, shape (m,): faces that share a vertex or a crack belong together.
+    """Return the component of each face, shape (m,): faces on one vertex or crack belong together.
 
     Vertices are merged by position; open patches whose rims come closer than the mean edge join.
     """
@@ -336,7 +339,7 @@ def _rim(edges: IntArray) -> IntArray:
 
 
 def _patch_volumes(surface: SurfaceMesh, labels: IntArray) -> FloatArray:
-    """Return |Signed volume| of each component about its own centre [m3]."""
+    """Return the absolute volume of each component about its own centre [m3]."""
     parts = [surface.faces[labels == k] for k in range(labels.max() + 1)]
     return np.array([abs(signed_volume(surface.vertices, part)) for part in parts])
 
@@ -377,9 +380,9 @@ def _with_faces(
 
 
 def _winding_volume(surface: SurfaceMesh, n: int = 48) -> float:
-    """Volume inside the skin by quadrature with the indicator clip(1/2 - phi / h, 0, 1) [m3].
+    """Return the volume inside the skin by quadrature of clip(1/2 - phi / h, 0, 1) [m3].
 
-    phi is the signed distance, h the cell: n of them along the longest side of the box.
+    phi is the signed distance, h the cell: n cells along the longest side of the box.
     """
     h = float(surface.extent.max()) / n
     low = surface.bounding_box[0] - h
@@ -405,7 +408,7 @@ def _int64(faces: NDArray[Any]) -> IntArray:
 
 
 def axes_matrix(axes: str | ArrayLike) -> FloatArray:
-    """Return rigid map (4, 4) from the file's axes to RAS, from a name such as "LPS" or a matrix.
+    """Return the rigid map (4, 4) from the file's axes to RAS, from a name like "LPS" or a matrix.
 
     Raises SurfaceError for an unknown name or a matrix that is not a rotation or mirror.
     """

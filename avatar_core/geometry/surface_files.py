@@ -1,8 +1,8 @@
 """Surface file formats: each reader returns vertices and triangles, unconnected and unchecked.
 
-Meshes give triangles in the file's coordinates. Of label maps
-(:mod:`avatar_core.geometry.label_maps`) the surface of one label is made.
-Nothing is checked here but that the file can be read; :mod:`avatar_core.geometry.surface` decides.
+Meshes give triangles in the file's coordinates. A label map gives the surface of one label
+(:mod:`avatar_core.geometry.label_maps`). This module checks only that the file can be read;
+:mod:`avatar_core.geometry.surface` decides.
 """
 
 from __future__ import annotations
@@ -37,14 +37,15 @@ HEADER_BYTES = 1 << 16  # of a file in which its axes are looked for
 
 @dataclass(frozen=True)
 class Format:
-    """How one format of meshes is read.
+    """Reader of one mesh format.
 
     Attributes
     ----------
     read : Callable[[bytes], Soup]
-        Vertices (n, 3) and triangles (m, 3) of a file's content.
+        Function that returns vertices (n, 3) and triangles (m, 3) of a file's content.
     comments : Callable[[bytes], bytes] or None
-        The part of a file's head that may state its axes; None if the format has none.
+        Function that returns the part of a file's head that may state its axes; None if the format
+        has none.
     """
 
     read: Callable[[bytes], Soup]
@@ -52,14 +53,14 @@ class Format:
 
 
 def content_of(path: Path) -> bytes:
-    """Return the file's bytes, for its hash; SurfaceError if there is no such ordinary file."""
+    """Return the file's bytes, for its hash; SurfaceError if it is no ordinary file."""
     with _naming(path), files.opened(path, MAX_FILE_BYTES) as source:
         return files.content_of(source)
 
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Turn what the system says of a file into a SurfaceError."""
+    """Turn an error of the operating system into a SurfaceError that names the file."""
     try:
         yield
     except (files.FileError, OSError) as error:
@@ -72,11 +73,11 @@ def stated_axes(path: Path) -> str | None:
     """Return the axes that a file's header states, "RAS" or "LPS"; None if it states none.
 
     3D Slicer writes ``SPACE=LPS`` or ``SPACE=RAS`` into the header of STL, the comments of OBJ and
-    PLY, and the title of legacy VTK, and ``LPS`` or ``RAS`` as the field ``SPACE`` of VTK's XML,
-    which alone may lie behind the first ``HEADER_BYTES``. Label maps say where their voxels lie,
-    and are read in RAS.
+    PLY, and the title of legacy VTK. In VTK's XML it writes ``LPS`` or ``RAS`` as the field
+    ``SPACE``, which alone may lie beyond the first ``HEADER_BYTES``. Label maps say where their
+    voxels lie, and are read in RAS.
 
-    Raises SurfaceError if there is no such ordinary file.
+    Raises SurfaceError if there is no ordinary file of that name.
     """
     if is_label_map(path):
         return "RAS"
@@ -101,7 +102,7 @@ def _ply_comments(head: bytes) -> bytes:
 
 
 def _stl_comments(head: bytes) -> bytes:
-    """The line ``solid`` of a text file, the 80 bytes before the triangles of a binary one."""
+    """Return the line ``solid`` of a text file, or the 80 bytes that begin a binary one."""
     is_text = head.startswith(b"solid") and b"\0" not in head
     return head.partition(b"\n")[0] if is_text else head[:80]
 
@@ -112,7 +113,7 @@ def _vtk_comments(head: bytes) -> bytes:
 
 
 def _vtp_comments(content: bytes) -> bytes:
-    """Return the field of that name; nothing of a file that is refused later, when it is read."""
+    """Return the field ``SPACE``; nothing for a broken file, which is refused later, on reading."""
     with suppress(Exception):
         return f"SPACE={stated_axes_of(content)}".encode()
     return b""
@@ -132,7 +133,7 @@ def parsed(
 ) -> tuple[Soup, tuple[str, ...]]:
     """Return the result of :func:`parse`, and notices of a label map.
 
-    label, inside, is_organ, mm : as of :func:`avatar_core.geometry.label_maps.surface_of_label`
+    For label, inside, is_organ and mm see :func:`avatar_core.geometry.label_maps.surface_of_label`.
     """
     kind = kind_of(path)
     if not kind:
@@ -151,7 +152,7 @@ def parsed(
 
 
 def _read_obj(content: bytes) -> Soup:
-    """Return the Wavefront OBJ: v, and f in all its forms (a, a/b, a//c, a/b/c, -1, polygons)."""
+    """Return the triangles of a Wavefront OBJ: v, and f as a, a/b, a//c, a/b/c, -1 or a polygon."""
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
     for line in content.decode("utf-8", errors="replace").splitlines():
@@ -165,7 +166,7 @@ def _read_obj(content: bytes) -> Soup:
 
 
 def _fan(polygons: Iterable[Iterable[int]]) -> IntArray:
-    """Split polygons into triangles that share their first corner, shape (m, 3)."""
+    """Split polygons into fans of triangles about their first corner, shape (m, 3)."""
     triangles = [
         (corners[0], b, c) for corners in map(list, polygons) for b, c in pairwise(corners[1:])
     ]
@@ -173,7 +174,7 @@ def _fan(polygons: Iterable[Iterable[int]]) -> IntArray:
 
 
 def _read_stl(content: bytes) -> Soup:
-    """Return the binary STL, whatever lies behind its last triangle, and text."""
+    """Return the triangles of an STL, in text or binary with anything after its last triangle."""
     n = int.from_bytes(content[80:84], "little")
     if 0 < 84 + 50 * n <= len(content):  # a text would have to be of gigabytes
         record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -189,7 +190,10 @@ def _read_stl(content: bytes) -> Soup:
 
 
 def _read_off(content: bytes) -> Soup:
-    """Return OFF in text, with or without colours, normals and texture (COFF, NOFF, STOFF)."""
+    """Return the triangles of an OFF in text, with or without colours, normals and texture.
+
+    Its keywords are OFF, COFF, NOFF and STOFF.
+    """
     text = content.decode("utf-8", errors="replace")
     begin = re.match(r"\s*(ST)?C?N?OFF(?![A-Za-z])", text)
     if begin is None or "BINARY" in text[: begin.end() + 10]:

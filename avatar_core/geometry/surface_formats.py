@@ -1,8 +1,8 @@
-"""The files that may hold an organ's surface, by their suffixes.
+"""Formats of files that may hold an organ's surface, by their suffixes.
 
-Commands, messages and folders that are searched take the names from here; help texts do so
-without loading a reader. :mod:`avatar_core.geometry.surface_files` reads meshes, and
-:mod:`avatar_core.geometry.label_files` label maps.
+Commands, messages and folder searches take the names from here, so help texts need no reader.
+:mod:`avatar_core.geometry.surface_files` reads meshes, and :mod:`avatar_core.geometry.label_files`
+label maps.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MESH_NAMES = ", ".join(suffix[1:].upper() for suffix in MESHES)
 LABEL_MAP_NAMES = ", ".join(LABEL_MAPS)
 MAX_FILE_BYTES = 4 << 30
 
-# First bytes of files whose names tell no format, such as the UIDs that DICOM is stored under.
+# First bytes of files whose names tell no format, e.g. the UIDs that DICOM is stored under.
 _BEGINNINGS = {
     ".nii": rb".{344}n\+1\0|.{4}n\+2\0",
     ".ply": rb"ply\s",
@@ -39,7 +39,7 @@ BYTE_ORDER_MARK = b"\xef\xbb\xbf"  # of UTF-8, with which some programs begin te
 
 
 def kind_of(path: Path) -> str:
-    """The suffix of a file's format: that of its name, or else what it begins with, or else ""."""
+    """Return the suffix of a file's format, by its name or else its first bytes; "" if unknown."""
     name = path.name.lower()
     by_name = next((suffix for suffix in SUFFIXES if name.endswith(suffix)), "")
     if by_name:
@@ -62,7 +62,7 @@ def kind_of(path: Path) -> str:
 
 
 def _inflated(head: bytes) -> bytes:
-    """The beginning of what a gzip file holds, of its beginning; nothing of a damaged one."""
+    """Return the decompressed beginning of a gzip file; empty if it is damaged."""
     try:
         return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(head, _LOOKED_AT)
     except zlib.error:

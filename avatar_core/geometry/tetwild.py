@@ -1,8 +1,9 @@
 """fTetWild by the compiled module of the package pytetwild, in a process for each mesh.
 
-The package around it imports pyvista, and with it VTK, for functions that are not needed here. In
-a process of its own fTetWild starts from one seed (see `tetwild_process`), and can end without
-this one: it leaves files where it runs, takes Ctrl-C for itself, and crashes on some surfaces.
+The package around the module imports pyvista, and with it VTK, for functions that are not needed
+here. In its own process fTetWild starts from one seed (see `tetwild_process`). Its process may fail
+without ending this one: fTetWild leaves files where it runs, takes Ctrl-C for itself, and crashes
+on some surfaces.
 """
 
 from __future__ import annotations
@@ -90,7 +91,7 @@ def fill_box(
 
 
 def _failure(run: subprocess.CompletedProcess[str]) -> MeshError:
-    """What a process that ended without a mesh has to say, in one line."""
+    """Return the error of a process that ended without a mesh, in one line."""
     said = run.stderr.strip().rpartition("\n")[2]
     kind = said.partition(":")[0]
     if run.returncode < 0:

@@ -1,11 +1,11 @@
-"""fTetWild in a process of its own, with a fixed seed: run as a script by `tetwild.fill_box`.
+"""fTetWild in its own process, with a fixed seed: run as a script by `tetwild.fill_box`.
 
 fTetWild seeds its generators from `std::random_device` and keeps them from call to call, so that
-two meshes of one surface differ. It takes no seed. Here the import of that one function is
-replaced, in the library as loaded into this process, which ends with the mesh: the same surface
-gives the same mesh, bit for bit, with any number of threads.
+two meshes of one surface differ. It takes no seed. This module replaces the import of
+`std::random_device` in the library as loaded into this process, which ends with the mesh. The same
+surface then gives the same mesh, bit for bit, with any number of threads.
 
-Imports numpy alone, since this is started anew for each mesh.
+The module imports numpy alone, since it is started anew for each mesh.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _loaded(library: str) -> ModuleType:
 
 
 def _replace_import(library: str, symbol: bytes, function: Any) -> bool:
-    """Let a loaded library call ``function`` where it calls ``symbol``; whether it imports it."""
+    """Let a loaded library call ``function`` for ``symbol``; return whether it imports it."""
     if not sys.platform.startswith("linux"):
         return False
     places = [_base(library) + where for where in _imports(np.fromfile(library, np.uint8), symbol)]

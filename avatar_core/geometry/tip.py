@@ -1,11 +1,11 @@
 """Tips of tools: bodies of revolution whose height over their lowest point is f(r), r < radius.
 
-On an elastic half-space contact follows from f alone (Sneddon, Int. J. Eng. Sci. 3:47, 1965, in
-the notation of Popov & Hess, Method of Dimensionality Reduction, 2015): pressed to the depth
+On an elastic half-space contact follows from f alone (Sneddon, Int. J. Eng. Sci. 3:47, 1965). In
+the notation of Popov & Hess (Method of Dimensionality Reduction, 2015), the tip at the depth
 
     g(a) = a int_0^a f'(r) / sqrt(a^2 - r^2) dr,
 
-the tip touches over a circle of radius a. Beyond ``radius`` is the shaft, which is not felt.
+touches over a circle of radius a. Beyond ``radius`` is the shaft, which has no contact.
 """
 
 from __future__ import annotations

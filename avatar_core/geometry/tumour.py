@@ -1,4 +1,4 @@
-"""A tumour: which part of each tetrahedron of an organ it fills, and of what a tip strains.
+"""Tumour in an organ: the fraction that it fills of each tetrahedron and of a tip's strain energy.
 
 Its level set is the second one of the organ (paper, Sec. 4): the signed distance to its surface,
 which may have several bodies. The mesh does not conform to it; a tetrahedron that it cuts has the
@@ -36,7 +36,7 @@ def read_tumour(
 def volume_fraction_inside(mesh: TetMesh, tumour: SurfaceMesh) -> np.ndarray:
     """Return the volume fraction of each tetrahedron inside a tumour, shape (n_tets,).
 
-    Counted on a lattice of points in each tetrahedron near it.
+    The fraction is counted on a lattice of points in each tetrahedron near the tumour.
 
     Raises
     ------
@@ -69,18 +69,20 @@ def volume_fraction_inside(mesh: TetMesh, tumour: SurfaceMesh) -> np.ndarray:
 def strained_fraction(
     tumour: SurfaceMesh, points: np.ndarray, normals: np.ndarray, radius: float, reach: float
 ) -> np.ndarray:
-    """Fraction of the energy under a normal force that a half-space would store in the tumour.
+    """Return the fraction of strain energy under a normal force that lies in the tumour.
 
-    At the distance r and the angle t from the axis a point force on an incompressible half-space
-    stores (Boussinesq; Johnson, Contact Mechanics, 1985, Sec. 3.2)
+    The energy is the one in an elastic half-space. A point force on an incompressible half-space
+    stores, at the distance r and the angle t from the axis (Boussinesq; Johnson, Contact Mechanics,
+    1985, Sec. 3.2),
 
         W = sigma_rr^2 / (2 E),      sigma_rr = 3 F cos(t) / (2 pi r^2),
 
-    here constant in r within the contact's radius. By first-order perturbation a tumour of
-    contrast c there changes the compliance to 1 - f + f / c of what it was, f this fraction.
+    here constant in r within the contact's radius. To first order, a tumour of contrast c
+    multiplies the compliance by 1 - f + f / c, f being this fraction.
 
     Parameters
     ----------
+    tumour : SurfaceMesh
     points : ndarray, shape (n, 3)
         Points on the surface [m].
     normals : ndarray, shape (n, 3)
@@ -92,7 +94,8 @@ def strained_fraction(
 
     Returns
     -------
-    ndarray, shape (n,), from 0 to 1
+    ndarray, shape (n,)
+        Fraction from 0 to 1.
     """
     fraction = np.zeros(len(points))
     middle = tumour.vertices.mean(axis=0)
@@ -111,8 +114,10 @@ def strained_fraction(
 
 
 def _beneath(radius: float, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Directions that stand for equal energies (k, 3), the last component inward; distances (m,)
-    [m] and their weights, which sum to one.
+    """Return sample points of equal energy beneath a contact.
+
+    Directions (k, 3) have the last component inward; distances (m,) [m] and their weights, which
+    sum to one.
     """
     cosine = ((np.arange(_POLAR) + 0.5) / _POLAR) ** (1.0 / 3.0)  # of the density cos^2
     angle = 2.0 * np.pi * (np.arange(_AZIMUTHS) + 0.5) / _AZIMUTHS

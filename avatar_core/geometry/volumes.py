@@ -35,12 +35,13 @@ class Volume:
     Attributes
     ----------
     values : ndarray, shape (n_layers, nx, ny, nz)
+        Voxels.
     affine : ndarray, shape (4, 4)
-        Affine from indices to RAS [mm].
+        Map from indices to RAS [mm].
     segments : tuple[Segment, ...]
         Segments that the file names.
     notices : tuple[str, ...]
-        What the file leaves open or contradicts, one line each.
+        Gaps and contradictions in the file, one line each.
     """
 
     values: NDArray[Any]

@@ -1,10 +1,10 @@
 """Surfaces in legacy VTK files, versions 1 to 5.1, in ASCII and binary (big endian).
 
-A file is five lines of header and then sections, each a keyword with counts and its numbers:
-``POINTS``; ``POLYGONS``, ``TRIANGLE_STRIPS``, and ``CELLS`` with ``CELL_TYPES``, which become
-triangles; ``VERTICES``, ``LINES``, ``METADATA`` and ``FIELD``, which are skipped. It is read as far
-as ``POINT_DATA`` or ``CELL_DATA``, behind which there is no geometry. What a count claims is
-compared with what the file holds before memory is allocated for it.
+A file is five lines of header and then sections, each a keyword with counts and its numbers.
+``POINTS`` are read. ``POLYGONS``, ``TRIANGLE_STRIPS``, and ``CELLS`` with ``CELL_TYPES`` become
+triangles. ``VERTICES``, ``LINES``, ``METADATA`` and ``FIELD`` are skipped. Reading ends at
+``POINT_DATA`` or ``CELL_DATA``, behind which there is no geometry. Counts are compared with the
+file's size before memory is allocated.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ _NEWEST = 5
 
 
 def read_vtk(content: bytes) -> Soup:
-    """Points and triangles of a legacy VTK file of polygonal data or of an unstructured grid.
+    """Return points and triangles of a legacy VTK file of polygonal data or an unstructured grid.
 
-    Polygons of more than three corners become fans about their first corner, those of fewer none;
-    the triangles of strips come last. Whether their corners exist is not checked.
+    Polygons of more than three corners become fans about their first corner; smaller ones give no
+    triangle. The triangles of strips come last. Whether their corners exist is not checked.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def read_vtk(content: bytes) -> Soup:
     Raises
     ------
     ValueError, OverflowError
-        The file is none of these, ends too early, or contradicts itself.
+        If the file is no VTK surface, ends too early, or contradicts itself.
     """
     return _Reader(content).surface()
 
@@ -100,7 +100,7 @@ class _Reader:
     # --- sections -------------------------------------------------------------------------------
 
     def _header(self) -> None:
-        """Version, title, and ASCII or BINARY: three lines."""
+        """Read version, title, and ASCII or BINARY: three lines."""
         version = _VERSION.fullmatch(self._line())
         if version is None:
             raise ValueError("it does not begin with '# vtk DataFile Version'")
@@ -121,7 +121,7 @@ class _Reader:
             return values.astype(np.float64).reshape(n, 3)
 
     def _cells(self) -> Cells:
-        """Cells of any number of corners: the counts before the corners, or since 5.0 offsets."""
+        """Read cells of any number of corners: counts before the corners, or since 5.0 offsets."""
         n, size = self._count(), self._count()
         if self._version < 5:
             return _split(self._numbers(size, np.dtype(">i4")), n)
@@ -149,13 +149,13 @@ class _Reader:
             raise ValueError(f"unknown section {keyword[:20]!r}")
 
     def _skip_metadata(self) -> None:
-        """Metadata end with an empty line."""
+        """Pass over metadata, which end with an empty line."""
         self._line()
         while self._line().strip():
             pass
 
     def _skip_array(self) -> None:
-        """An array of a field: its name, components, tuples, type and numbers."""
+        """Pass over an array of a field: its name, components, tuples, type and numbers."""
         name = self._word()
         if name == "METADATA":  # of the array before
             self._skip_metadata()
@@ -170,7 +170,7 @@ class _Reader:
             self._numbers(count, self._type())
 
     def _skip_strings(self, count: int) -> None:
-        """Strings begin with the next line: one a line, or each behind its length."""
+        """Pass over strings from the next line on: one a line, or each after its length."""
         self._line()
         self._require(count)
         for _ in range(count):
@@ -180,7 +180,10 @@ class _Reader:
                 self._line()
 
     def _skip_binary_string(self) -> None:
-        """The highest two bits of a length say whether it has 8, 4, 2 or 1 bytes."""
+        """Pass over a string after its length.
+
+        The highest two bits of the length say whether it has 8, 4, 2 or 1 bytes.
+        """
         self._require(1)
         n_bytes = 8 >> (self._content[self._at] >> 6)
         self._require(n_bytes)
@@ -237,7 +240,7 @@ class _Reader:
         return kind
 
     def _numbers(self, count: int, kind: np.dtype[Any]) -> NDArray[Any]:
-        """That many numbers from here on, shape (count,); binary ones begin with the next line."""
+        """Return the next numbers, shape (count,); binary ones begin with the next line."""
         if self._binary:
             self._line()
         self._require(count * kind.itemsize if self._binary else 2 * count - 1)
@@ -270,7 +273,7 @@ def _no_triangles() -> IntArray:
 
 
 def _split(row: NDArray[Any], n: int) -> Cells:
-    """The n cells of a row [k, corner 1, ..., corner k, ...]; ValueError if it holds others."""
+    """Return the n cells of a row [k, corner 1, ..., corner k, ...]; ValueError if n is wrong."""
     if n > len(row):
         raise ValueError(f"{n} cells do not fit into {len(row)} numbers")
     counts = np.empty(n, dtype=np.int64)
@@ -288,7 +291,7 @@ def _split(row: NDArray[Any], n: int) -> Cells:
 
 
 def _chosen(cells: Cells, kept: NDArray[Any]) -> Cells:
-    """Some of the cells, a mask (n,)."""
+    """Return the cells that a mask (n,) keeps."""
     starts, corners = cells
     lengths = np.diff(starts)
     if len(kept) != len(lengths):
@@ -297,9 +300,9 @@ def _chosen(cells: Cells, kept: NDArray[Any]) -> Cells:
 
 
 def _windows(starts: IntArray) -> tuple[IntArray, IntArray]:
-    """Triangles that the cells make: their cells' first corners, and their places in their cells.
+    """Return the first corner of each triangle's cell, and the triangle's place in its cell.
 
-    A cell of k corners makes k - 2 triangles, one of fewer than three none. Shapes (m,), (m,).
+    A cell of k corners makes k - 2 triangles, and none for fewer than three. Shapes (m,), (m,).
     """
     numbers = np.maximum(np.diff(starts) - 2, 0)
     first = np.repeat(starts[:-1], numbers)
@@ -314,7 +317,7 @@ def fans(starts: IntArray, corners: IntArray) -> IntArray:
 
 
 def strips(starts: IntArray, corners: IntArray) -> IntArray:
-    """Triangles of strips, every second one turned so that all face one way, shape (m, 3)."""
+    """Return the triangles of strips, every second one turned to face one way, shape (m, 3)."""
     first, place = _windows(starts)
     turned = place % 2
     at = first + place

@@ -1,9 +1,9 @@
 """Polygonal data in VTK's XML files (.vtp), in all of their encodings.
 
-``VTKFile > PolyData > Piece`` holds ``Points``, ``Polys`` and ``Strips``; each is an array that is
-written as text, inline in base64, or appended behind everything else in base64 or raw; the last
-three begin with their sizes and may be compressed in blocks. What is claimed is compared with what
-is there before memory is allocated for it, and no document type is read.
+``VTKFile > PolyData > Piece`` holds ``Points``, ``Polys`` and ``Strips``. Each is an array written
+as text, inline in base64, or appended after everything else in base64 or raw. Arrays other than
+text begin with their sizes and may be compressed in blocks. Claimed sizes are compared with the
+file before memory is allocated. No document type is read.
 
 https://docs.vtk.org/en/latest/vtk_file_formats/vtkxml_file_format.html
 """
@@ -32,7 +32,9 @@ _AXES = "SPACE"  # the field in which 3D Slicer states them
 
 
 def read_vtp(content: bytes) -> Soup:
-    """Points and triangles of all pieces; polygons become fans, strips come last in each piece.
+    """Return points and triangles of all pieces; polygons become fans.
+
+    The triangles of strips come last in each piece.
 
     Returns
     -------
@@ -42,8 +44,8 @@ def read_vtp(content: bytes) -> Soup:
     Raises
     ------
     ValueError and errors of the parsers
-        The file is no such file, ends too early, or contradicts itself, as with corners that do
-        not exist.
+        If the file is no .vtp file, ends too early, or contradicts itself, e.g. names missing
+        corners.
     """
     file = _File(content)
     points: list[FloatArray] = [np.empty((0, 3))]
@@ -60,7 +62,7 @@ def read_vtp(content: bytes) -> Soup:
 
 
 def stated_axes_of(content: bytes) -> str:
-    """What the file's field data say of its axes; empty if nothing."""
+    """Return the axes that the file's field data state; empty if none."""
     file = _File(content)
     for array in file.polydata.iterfind("FieldData/*"):
         if array.get("Name") == _AXES:
@@ -69,7 +71,7 @@ def stated_axes_of(content: bytes) -> str:
 
 
 class _File:
-    """The elements of a file, and what is appended to them."""
+    """The elements of a file, and the data appended to them."""
 
     def __init__(self, content: bytes) -> None:
         head, appended, tail = content.partition(_APPENDED)
@@ -87,7 +89,7 @@ class _File:
         self._size = np.dtype(self._order + _TYPES[self._root.get("header_type", "UInt32")])
 
     def points(self, piece: Element) -> FloatArray:
-        """Of a piece, shape (n, 3)."""
+        """Return the points of a piece, shape (n, 3)."""
         array = piece.find("Points/DataArray")
         if array is None:
             return np.empty((0, 3))
@@ -95,7 +97,7 @@ class _File:
             return self.numbers(array).astype(np.float64).reshape(-1, 3)
 
     def cells(self, piece: Element, name: str) -> tuple[IntArray, IntArray]:
-        """Where each cell begins and the last ends, and the corners."""
+        """Return where each cell begins and the last ends, and the corners."""
         arrays = {array.get("Name"): array for array in piece.iterfind(f"{name}/DataArray")}
         if not {"offsets", "connectivity"} <= arrays.keys():
             return np.zeros(1, dtype=np.int64), np.empty(0, dtype=np.int64)
@@ -149,7 +151,7 @@ def _n_letters(n_bytes: int) -> int:
 
 
 def _part(data: bytes, start: int, n: int, is_raw: bool) -> bytes:
-    """Return ``n`` bytes from ``start`` on, of what is raw or in base64."""
+    """Return ``n`` bytes from ``start`` on, of raw data or base64."""
     end = start + n
     part = data[:end] if is_raw else base64.b64decode(data[: _n_letters(end)])[:end]
     if len(part) < end:
