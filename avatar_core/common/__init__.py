@@ -1,4 +1,4 @@
-"""What every room needs and none owns: files and HDF5 with checks, numbers with units, splines,
-the compiler settings of the 1 kHz step. Plain values come in and go out; the only equations here
-are those of uniform quadratic B-splines.
+"""Tools that every room needs: checked files, HDF5, numbers with units, splines, compilation.
+
+Plain values come in and go out. The only equations here are those of uniform quadratic B-splines.
 """

@@ -1,4 +1,4 @@
-"""Tables of the kind and shape that the arrays of a file must have, with sizes by name.
+"""Checks of the kind and shape that the arrays of a file must have, with named sizes.
 
     {"mesh/vertices": "f: vertices 3", "far/space": "f: 3*vertices rank"}
 
@@ -26,8 +26,8 @@ def require_shapes(arrays: Mapping[str, np.ndarray], shapes: Shapes) -> dict[str
     Raises
     ------
     StorageError
-        Naming the first array that is missing, of another kind, not finite, or of sizes that
-        do not fit those before it.
+        If an array is missing, of another kind, not finite, or its sizes do not fit the arrays
+        before it. The message names the first.
     """
     sizes: dict[str, int] = {}
     for key, wanted in shapes.items():

@@ -4,15 +4,14 @@
     contact = allocate(Contact, {"T": 2})
     table = ArrayTable(contact)
 
-By value, numba takes a tuple of n arrays apart into 7 n numbers at every call and puts it together
-again in every function: with the 150 arrays of a step, that was most of what it compiled. An
-:class:`ArrayTable` writes where each array lies, its shape and its strides into a table once;
-compiled code gets the table's address and reads, of the arrays that it names, what it needs.
-Attributes read as those of the tuple do. What is read never changes, and the compiler is told so:
-it reads it before a loop, not within.
+By value, numba splits a tuple of n arrays into 7 n numbers at every call and rebuilds it in every
+function. With the 150 arrays of a step, that was most of what it compiled. An :class:`ArrayTable`
+writes address, shape and strides of each array into a table once. Compiled code gets the table's
+address and reads only the arrays that it names. Their attributes read like those of the tuple. The
+table never changes, and the compiler is told so: it reads the table before a loop, not within.
 
-A member of a kind may be another kind, and None in a tuple of it. Compiled code then finds a table
-whose ``on`` is False: one compiled function serves both.
+A member of a kind may be another kind, and None in a tuple of the kind. Compiled code then finds a
+table whose ``on`` is False: one compiled function serves both.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ _WORD = ir.IntType(64)
 
 
 class Declared(NamedTuple):
-    """An array of a kind: its dimensions by name or number, and its value at first."""
+    """Declaration of an array: its dimensions by name or number, its type and its first value."""
 
     shape: tuple[str, ...]
     dtype: np.dtype[Any]
@@ -49,7 +48,7 @@ class Declared(NamedTuple):
 
 
 def array(shape: str, dtype: Any = np.float64, start: float = 0.0) -> Declared:
-    """Declare an array, as ``array("T 3")``; compiled code knows its type and dimensions."""
+    """Declare an array, e.g. ``array("T 3")``; compiled code knows its type and dimensions."""
     return Declared(tuple(shape.split()), np.dtype(dtype), start)
 
 
@@ -60,12 +59,15 @@ def kind(name: str, **members: Any) -> Any:
 
 
 def allocate(of: Any, sizes: Mapping[str, int], **given: Any) -> Any:
-    """Return a tuple of a kind with all arrays at their first value, but those that are given.
+    """Return a tuple of a kind with all arrays at their first value, except those given.
 
     Parameters
     ----------
+    of : kind
     sizes : Mapping[str, int]
-        Sizes of the dimensions that have names; nested kinds are None unless given.
+        Sizes of the dimensions that have names.
+    given : ndarray or tuple
+        Members with other values; nested kinds are None unless given.
     """
 
     def made(name: str, member: Any) -> Any:
@@ -88,7 +90,7 @@ def sizes_of(arrays: Any) -> dict[str, int]:
 
 
 def restart(arrays: Any, kept: Iterable[str] = ()) -> None:
-    """Set all arrays to their first value, in other tuples too, but the members to be kept."""
+    """Set all arrays to their first value, except the members to be kept; nested tuples too."""
     for name, member in arrays.members.items():
         value = getattr(arrays, name)
         if name in kept or value is None:
@@ -111,7 +113,10 @@ def flat(arrays: Any, prefix: str = "") -> dict[str, np.ndarray]:
 
 
 def gathered(of: Any, arrays: Mapping[str, np.ndarray], prefix: str = "") -> Any:
-    """Return the inverse of :func:`flat`; None for a kind of which there is no array."""
+    """Return the tuple of a kind from named arrays, the inverse of :func:`flat`.
+
+    A kind with no array is None.
+    """
     if prefix and not any(name.startswith(prefix) for name in arrays):
         return None
     return of(
@@ -125,20 +130,23 @@ def gathered(of: Any, arrays: Mapping[str, np.ndarray], prefix: str = "") -> Any
 
 
 class ArrayTable:
-    """Where the arrays of a tuple lie, and those of the tuples in it.
+    """Table of the addresses, shapes and strides of a tuple's arrays, nested tuples included.
 
     Parameters
     ----------
-    arrays : Any
+    arrays : tuple
         The tuple, kept alive.
+
+    Attributes
+    ----------
     numba_type : TableType
-    address
+    address : int
         Address of the table, for compiled code.
 
     Raises
     ------
     TypeError
-        For an array that is not contiguous, or of another type than was declared.
+        If an array is not contiguous, or has another type than declared.
     """
 
     def __init__(self, arrays: Any) -> None:
@@ -149,10 +157,10 @@ class ArrayTable:
 
 
 class TableType(types.Type):
-    """Names and numba types of a kind's members, and where the words of each begin.
+    """Numba type of a table: names and types of a kind's members, and where each begins.
 
-    The first word of a table is whether it is on. Compiled code writes to no constant, so that
-    arrays that may not be written are of the same type as others.
+    The first word of a table says whether it is on. Read-only and writable arrays have the same
+    type, because compiled code writes to no constant.
     """
 
     def __init__(self, of: Any) -> None:
@@ -244,7 +252,7 @@ def _array(context: Any, builder: Any, of: Any, first: Any) -> Any:
 
 
 def _load_constant(builder: Any, word: Any) -> Any:
-    """What lies there for as long as the code runs."""
+    """Load a word that does not change as long as the code runs."""
     value = builder.load(word)
     value.set_metadata("invariant.load", builder.module.add_metadata([]))
     return value

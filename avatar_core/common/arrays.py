@@ -1,4 +1,4 @@
-"""Types of arrays, and points that are chosen from many."""
+"""Array types, rounding of values, and a choice of well-spread points."""
 
 from __future__ import annotations
 
@@ -11,26 +11,30 @@ Soup = tuple[FloatArray, IntArray]  # points and triangles
 
 
 def short(values: FloatArray) -> NDArray[np.float32]:
-    """Return the values of 12 significant bits, which compress: off by 1.2e-4 of each at most."""
+    """Return values with 12 significant bits, which compress well.
+
+    Relative error 1.2e-4 at most.
+    """
     bits = np.asarray(values, np.float32).view(np.uint32)
     return ((bits + np.uint32(1 << 11)) & np.uint32(0xFFFFF000)).view(np.float32)
 
 
 def farthest_points(points: FloatArray, n: int, first: int = 0) -> IntArray:
-    """Some points far from one another: each the farthest from all before it.
+    """Return points far from one another: each is the farthest from all before it.
 
     Parameters
     ----------
     points : ndarray, shape (n_points, 3)
         Points [m].
     n : int
-        How many, all of them at most.
+        Number of points to choose; all points at most.
     first : int
-        The one to begin with.
+        Index of the first point.
 
     Returns
     -------
-    ndarray of int, shape (n,), in the order in which they are chosen
+    ndarray of int, shape (n,)
+        Indices, in the order of choice.
     """
     chosen, distance = [first], np.full(len(points), np.inf)
     while len(chosen) < min(n, len(points)):

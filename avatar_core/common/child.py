@@ -1,7 +1,7 @@
 """A process for a part of the work: started when it is needed, and again after it ended.
 
-The process may crash, be killed or be ended half-way without harm to the one that started it. Both
-exchange pickled notes. Whoever starts it therefore has to trust it as itself.
+The process may crash, be killed or be ended half-way without harm to its starter. Both exchange
+pickled notes, so the starter has to trust the process like itself.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ class EndedError(AvatarError):
 
 
 class Child:
-    """``python -m MODULE ARGUMENTS``, one process at a time.
+    """Process ``python -m MODULE ARGUMENTS``, one at a time.
 
-    Its standard input is a line for notes, unless it is started with another file. Notes are sent
-    and received by one thread at a time; any thread may end the process.
+    Its standard input is a connection for notes, unless it is started with another file. Notes are
+    sent and received by one thread at a time; any thread may end the process.
 
     Parameters
     ----------
     module : str
-        To be run.
+        Module to run.
     arguments : str
-        Of the module, each time that it is started.
+        Arguments of the module at every start.
     options : Any
-        Of :class:`ModuleProcess`.
+        Options of :class:`ModuleProcess`.
     """
 
     def __init__(self, module: str, *arguments: str, **options: Any) -> None:
@@ -73,14 +73,14 @@ class Child:
         Parameters
         ----------
         arguments : str
-            Of this start, after those of each.
+            Arguments of this start, after the arguments of every start.
         stdin : int, optional
-            File to take the place of the line for notes.
+            File that takes the place of the connection for notes.
 
         Raises
         ------
         EndedError
-            If the system does not start it.
+            If the system does not start the process.
         """
         if self.is_running:
             return
@@ -107,7 +107,7 @@ class Child:
             raise EndedError(self.finish(_GONE)) from error
 
     def has_sent(self, seconds: float) -> bool:
-        """Whether there is a note to be received, or an end to be noticed, within a time [s]."""
+        """Return whether a note arrives, or the process ends, within a time [s]."""
         try:
             return self._open_line().poll(seconds)
         except OSError:
@@ -126,7 +126,7 @@ class Child:
             process.send_signal(number)
 
     def finish(self, seconds: float, number: int = signal.SIGTERM) -> str:
-        """End the process, if there is one: by a signal, and if it does not end in time, kill it.
+        """End the process, if there is one: by a signal, and by SIGKILL if it does not end in time.
 
         Returns
         -------
@@ -165,7 +165,7 @@ def computed_by(pid: int) -> float:
 
 @contextmanager
 def deferred_signals() -> Iterator[None]:
-    """In the main thread, what Python does at SIGINT or SIGTERM is done after the body."""
+    """Defer Python's handling of SIGINT and SIGTERM in the main thread until after the body."""
     came: list[int] = []
     before: dict[int, Any] = {}
     try:
@@ -183,7 +183,7 @@ def deferred_signals() -> Iterator[None]:
 
 @contextmanager
 def line_to_starter() -> Iterator[Connection]:
-    """In the process: the line to the one that started it; when that closes it, the body ends."""
+    """Connect the process to its starter; when the starter closes the connection, the body ends."""
     line = Connection(os.dup(sys.stdin.fileno()))
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         yield line

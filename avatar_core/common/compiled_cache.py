@@ -1,10 +1,10 @@
 """Compiled functions on disk, found by the content of everything that they may be made of.
 
-numba's own cache looks at the file of a function alone. What is inlined from another file, or read
-from it as a constant, may change without its notice: it then runs the old code. Here the folder's
-name is the hash of all rooms from which compiled functions take code, so that a change anywhere in
-them is a new folder. Each specialisation is a file of its own: numba's index, a file that two
-processes may rewrite at once, can mix up what they compile.
+numba's own cache looks at the file of a function alone. Code inlined from another file, or
+constants read from it, may change without its notice: it then runs the old code. Here the folder's
+name is the hash of all rooms from which compiled functions take code. A change anywhere in them is
+a new folder. Each specialisation is a file of its own, because two processes that rewrite numba's
+index at once can mix up their results.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def content() -> str:
 
 @functools.cache
 def folder() -> Path:
-    """Where compiled functions of this content lie: NUMBA_CACHE_DIR, the user's cache, or here.
+    """Return the folder of compiled functions: below NUMBA_CACHE_DIR, the user's cache, or here.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def _candidates() -> Iterator[Path]:
 
 
 def _drop_old(parent: Path) -> None:
-    """Remove the folders that were not used for longest, where another is to be made."""
+    """Remove the least recently used folders before another is made."""
     if not parent.is_dir() or (parent / content()).is_dir():
         return
     others = [path for path in parent.iterdir() if path.is_dir() and len(path.name) == 16]
@@ -87,11 +87,11 @@ def _drop_old(parent: Path) -> None:
 
 
 class _Locator:
-    """Tells numba the folder, and nothing of freshness, which is in its name."""
+    """Locator that tells numba the folder; freshness is in the folder's name."""
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
         self._py_file, self._line = file, function.__code__.co_firstlineno
-        # Files outside those rooms, such as benchmarks, add their own content.
+        # Files outside those rooms, e.g. benchmarks, add their own content.
         own = hashlib.sha256(Path(file).read_bytes()).hexdigest()[:8]
         self._path = str(folder() / f"{Path(file).stem}-{own}")
 
@@ -117,7 +117,7 @@ class _Implementation(CompileResultCacheImpl):
 
 
 class _OneFileEach(IndexDataCacheFile):
-    """Specialisations under names that follow from their types, so that no index is needed."""
+    """Index that derives file names of specialisations from their types, so needs no index file."""
 
     def save(self, key: Any, data: Any) -> None:
         self._save_data(self._name_of(key), data)
@@ -135,7 +135,7 @@ class _OneFileEach(IndexDataCacheFile):
 
 
 class ContentCache(FunctionCache):
-    """The cache of one function; put in the place of a dispatcher's own."""
+    """Cache of one function, put in the place of a dispatcher's own."""
 
     _impl_class = _Implementation
 

@@ -1,13 +1,13 @@
 """Calls in a separate process with limits of time and memory, for reading files of others.
 
-Some damaged files crash the libraries behind HDF5 and NIfTI (a segmentation fault of HDF5
-2.0), hang them or make them allocate all memory, before any check of this project. In a process of
-their own they do no harm: if it dies, another is started.
+Some damaged files crash the libraries behind HDF5 and NIfTI (a segmentation fault of HDF5 2.0),
+hang them or make them allocate all memory, before any check of this project. In a process of their
+own they do no harm: if it dies, another is started.
 
 This protects against accidents, not against attacks: results are pickled, and the process has the
 rights of its user.
 
-Run as ``python -m avatar_core.common.confined MAX_BYTES`` by ``Confined``, never by hand.
+``Confined`` runs this module as ``python -m avatar_core.common.confined MAX_BYTES``.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _STOP_SECONDS = 0.1  # to end before it is killed
 
 
 class ConfinedError(AvatarError):
-    """A call ended its process, took too long or too much memory, or failed in its own way."""
+    """A call ended its process, exceeded its time or memory, or failed unexpectedly."""
 
 
 class Imported:
@@ -51,6 +51,7 @@ class Imported:
         self._module, self._name = module, name
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Call the function, importing its module first."""
         return _imported(self._module, self._name)(*args, **kwargs)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -71,7 +72,7 @@ class Confined:
     Parameters
     ----------
     max_bytes : int
-        Address space, beyond that of the process before its first call [bytes].
+        Address space beyond the process's use before its first call [bytes].
     """
 
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:
@@ -85,7 +86,7 @@ class Confined:
 
     @property
     def pid(self) -> int | None:
-        """Of the process, if there is one."""
+        """Id of the process; None if there is none."""
         return self._child.pid
 
     def call(
@@ -93,20 +94,20 @@ class Confined:
     ) -> R:
         """Return ``function(*args, **kwargs)``; all of them can be pickled.
 
-        ``Imported`` in place of a function keeps this process free of what the function needs.
+        ``Imported`` in place of a function keeps this process free of the function's imports.
 
         Parameters
         ----------
         seconds : float
-            Seconds of processor time that it may take, whatever else the machine has to do; what it
-            imports while it is loaded does not count [s].
+            Limit of processor time, independent of the machine's load [s]. Imports while the
+            function is loaded do not count.
 
         Raises
         ------
         AvatarError
-            That the function raises.
+            If the function raises it.
         ConfinedError
-            If it raises anything else, ends the process or takes longer.
+            If the function raises anything else, ends the process or takes longer.
         """
         with self._lock:
             try:
@@ -125,21 +126,21 @@ class Confined:
         return value
 
     def load(self, function: Callable[..., Any]) -> None:
-        """Start the process and have it import what a function needs: the next call is faster.
+        """Start the process and import the modules of a function: the next call is faster.
 
         Raises
         ------
         ConfinedError
-            If it cannot be imported.
+            If the function cannot be imported.
         """
         self.call(_START_SECONDS, _nothing, function)
 
     def kill(self) -> None:
-        """End the process, whatever it does; a call that waits for it raises ConfinedError."""
+        """End the process at once; a waiting call raises ConfinedError."""
         self._child.send_signal(signal.SIGKILL)
 
     def close(self) -> None:
-        """End the process, if there is one, after the call that it is in."""
+        """End the process, if there is one, after its present call."""
         with self._lock:
             self._child.finish(_STOP_SECONDS)
 
@@ -176,11 +177,11 @@ def _called(function: Callable[..., Any], args: Any, kwargs: Any) -> tuple[str, 
 
 
 def _nothing(function: Callable[..., Any]) -> None:
-    """Return: what the function needs was imported when it came in."""
+    """Return at once: the function's modules were imported when the function came in."""
 
 
 def main(max_bytes: int) -> int:
-    """Call what is asked for, until the line is closed."""
+    """Answer calls until the connection is closed."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * resource.getpagesize() + max_bytes
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))

@@ -1,8 +1,8 @@
-"""Values for JSON; and dataclasses from JSON of unknown origin, checked field by field.
+"""Conversion of values to JSON, and of JSON of unknown origin to dataclasses, checked by field.
 
 The inverse of ``json.dumps(dataclasses.asdict(...))``. msgspec.convert is faster (0.3 ms instead of
-9 ms for the largest attribute) but, like pydantic, ignores fields that a plain dataclass does not
-have, which is how a newer file is recognised here.
+9 ms for the largest attribute). But msgspec, like pydantic, ignores fields that a plain dataclass
+does not have. Unknown fields are how a newer file is recognised here.
 """
 
 from __future__ import annotations
@@ -50,17 +50,20 @@ def parsed(text: str, key: str) -> Any:
 
 
 def of_plain(kind: type[Kind], value: Any, key: str) -> Kind:
-    """A value of some type: a number, text, tuple, Literal, Enum, union or dataclass of these.
+    """Return a value of a type: a number, text, tuple, Literal, Enum, union or dataclass of these.
 
     Parameters
     ----------
+    kind : type
+    value : Any
+        Value as JSON gives it.
     key : str
-        Key where the value stands, for errors.
+        Place of the value, for errors.
 
     Raises
     ------
     StorageError
-        Naming the field that is missing, unknown or of another type.
+        If a field is missing, unknown or of another type; the message names it.
     AvatarError
         Raised by the dataclass for values out of range.
     """

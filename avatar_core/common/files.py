@@ -1,4 +1,4 @@
-"""Opening files of unknown origin, regular and of limited size; writing and finding our own.
+"""Opening of regular files of unknown origin and limited size; writing and finding our own.
 
 A path may name something else between the check and the opening, so the open descriptor is checked
 again; opening never blocks.
@@ -18,17 +18,18 @@ from avatar_core.errors import AvatarError, StorageError, one_line
 
 
 class FileError(AvatarError):
-    """A path does not name a readable regular file; the message is what follows the path."""
+    """A path does not name a readable regular file; the message completes "PATH ..."."""
 
 
 @contextmanager
 def opened(path: Path, max_bytes: int) -> Iterator[BinaryIO]:
-    """A regular file, open for reading.
+    """Open a regular file for reading.
 
     Raises
     ------
     FileError
-        No such file, no permission, a directory, device or pipe, or more than ``max_bytes``.
+        If the file is missing, forbidden, a directory, device or pipe, or larger than
+        ``max_bytes``.
     """
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):  # opening a device may act on it
@@ -60,7 +61,7 @@ def content_of(source: BinaryIO) -> bytes:
 
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
-    """A file to write in the place of another, which it takes on leaving without an error.
+    """Yield a file to write, which replaces another file on leaving without an error.
 
     Raises
     ------
@@ -88,7 +89,7 @@ def replaced(path: Path) -> Iterator[Path]:
 def shipped(folder: str) -> dict[str, Path]:
     """Return the YAML files in a folder of ``params``, by name without suffix; sorted.
 
-    They lie in ``params`` of a checkout, or below the prefix that pip or colcon installed this
+    The folder ``params`` is in the checkout, or below the prefix that pip or colcon installed this
     package into.
     """
     here, own = Path(__file__).resolve(), Path("params", folder)

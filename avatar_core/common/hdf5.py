@@ -1,8 +1,8 @@
 """The only module that opens HDF5 files: written complete or not at all, verified when read.
 
-No link that leaves a file is followed, and the size that its arrays claim is compared with the size
-of the file before they are read. The HDF5 library itself may still crash or hang on damaged files:
-files of others are read in a separate process, :mod:`avatar_core.common.confined`.
+No link that leaves a file is followed. The claimed size of the arrays is compared with the size of
+the file before they are read. The HDF5 library itself may still crash or hang on damaged files.
+Files of others are therefore read in a separate process, :mod:`avatar_core.common.confined`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from avatar_core.errors import StorageError, one_line
 Arrays = dict[str, np.ndarray]
 Attributes = dict[str, str]
 
-# What h5py raises for damaged files.
+# Errors that h5py raises for damaged files.
 UNREADABLE = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, ArithmeticError)
 
 
@@ -39,9 +39,12 @@ def replace_file(
 
     Parameters
     ----------
+    path : Path
+    arrays : dict[str, ndarray]
+    attributes : dict[str, str]
     packed : bool
-        Compress large arrays, without loss; not for arrays that are almost constant, as what a file
-        claims may exceed its size ``MAX_EXPANSION`` times only.
+        Compress large arrays, without loss. Not for almost constant arrays: claims above
+        ``MAX_EXPANSION`` times the file's size are refused.
 
     Raises
     ------
@@ -90,7 +93,7 @@ def verified(
     keys_of: Callable[[Collection[str]], Iterable[str]],
     remedy: str = "build or copy it again",
 ) -> tuple[Attributes, Arrays]:
-    """Attributes and arrays of a file, checked to be as they were written.
+    """Return attributes and arrays of a file, checked by its checksum.
 
     Parameters
     ----------
@@ -99,11 +102,11 @@ def verified(
     origin, what : str
         Name and kind of the file in messages.
     attributes_of : Callable[[Attributes, str], Attributes]
-        Selects the attributes to verify among those held; raises StorageError.
+        Function that selects the attributes to verify; raises StorageError.
     keys_of : Callable[[Collection[str]], Iterable[str]]
-        Selects the arrays to read among those held.
+        Function that selects the arrays to read.
     remedy : str
-        What messages advise.
+        Advice in messages.
 
     Raises
     ------
@@ -130,7 +133,7 @@ def verified(
 
 
 def format_of(path: Path, max_bytes: int) -> str | None:
-    """The attribute ``format`` of an HDF5 file, None if it is not one; nothing else is read."""
+    """Return the attribute ``format`` of an HDF5 file, None for other files; reads nothing else."""
     try:
         with opened(path, max_bytes) as source, h5py.File(source, "r") as file:
             return root_attributes(file).get("format")
@@ -139,7 +142,7 @@ def format_of(path: Path, max_bytes: int) -> str | None:
 
 
 def root_attributes(file: h5py.File) -> Attributes:
-    """Attributes of a file that are text."""
+    """Return the text attributes of a file."""
     values = dict(file.attrs)
     return {key: value for key, value in values.items() if isinstance(value, str)}
 
@@ -188,7 +191,7 @@ def require_schema(attributes: Attributes, present: str, origin: str, remedy: st
     Parameters
     ----------
     remedy : str
-        What makes an older file anew.
+        Advice on how to rebuild an older file.
     """
     schema = attributes["schema"]
     major, _, minor = schema.partition(".")

@@ -1,13 +1,13 @@
-"""How functions are compiled, and how those of the 1 kHz step cannot allocate.
+"""Compilation of functions, and settings by which the 1 kHz step cannot allocate.
 
-numba's reference counting is off in the step (``_nrt``): arrays come in from outside and outlive
-it, so that counting their users would cost a third of its time for nothing; and without it numba
-refuses, when it compiles, whatever would create an array. Every function but the entries is inlined
-into these and has no wrapper for Python; called from there, it runs as plain Python. A division by
+numba's reference counting is off in the step (``_nrt``). Arrays come in from outside and outlive
+the step, so counting their users would cost a third of its time for nothing. Without counting,
+numba refuses to compile whatever would create an array. Every function but the entries is inlined
+into these and has no wrapper for Python; called from Python, it runs as plain Python. A division by
 zero gives an infinity instead of an exception.
 
-Arrays come in as an :class:`avatar_core.common.array_table.ArrayTable`. What was compiled
-is kept on disk (:mod:`avatar_core.common.compiled_cache`).
+Arrays come in as an :class:`avatar_core.common.array_table.ArrayTable`. Compiled functions are kept
+on disk (:mod:`avatar_core.common.compiled_cache`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _NO_WRAPPERS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": 
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Compile by numba with its options, and keep the result by content."""
+    """Compile by numba with the given options, and keep the result on disk by content."""
 
     def compile_function(function: Callable[..., Any]) -> Any:
         dispatcher: Any = njit(**options)(function)
@@ -55,12 +55,12 @@ entry = compiled(**_STEP)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """Return the part of the step, exact about infinities and order."""
+    """Compile a part of the step, exact about infinities and order."""
     return _part(function)
 
 
 def fast(function: Callable[..., Any]) -> Any:
-    """Return the part of the step that may be reordered for speed."""
+    """Compile a part of the step that may be reordered for speed."""
     return _part(function, fastmath=True)
 
 
@@ -70,5 +70,5 @@ def _nothing(n):  # type: ignore[no-untyped-def]
 
 
 def load_compiler() -> None:
-    """Load what the first compiled function of a process takes half a second for."""
+    """Load the compiler, which takes half a second at the first compiled function of a process."""
     _nothing(0)

@@ -44,25 +44,25 @@ def n_cores() -> int:
 def on_all_cores(function: Callable[[Item], T], items: Iterable[Item]) -> Iterator[T]:
     """Yield the function of each item, in their order, in one thread for each core.
 
-    For functions that spend their time outside the interpreter, and give the same bits whatever
-    runs beside them. What has not begun is left out where the caller stops.
+    The function should spend its time outside the interpreter, and give the same bits whatever runs
+    beside it. Items that have not begun are dropped when the caller stops.
     """
     with ThreadPoolExecutor(n_cores()) as pool:
         yield from pool.map(function, items)
 
 
 def return_memory() -> None:
-    """Give what this process has freed back to the system, where its C library can (glibc)."""
+    """Give freed memory of this process back to the system, where its C library can (glibc)."""
     with contextlib.suppress(AttributeError, OSError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def free_at_once() -> None:
-    """From now on, arrays go back to the system as soon as they are freed (glibc).
+    """Return freed arrays to the system at once from now on (glibc).
 
-    Otherwise, each large array that is freed raises the size, up to 32 MB, below which those that
-    follow stay with the process: one that replays recordings of 27 MB kept 30 to 60 MB more. And
-    each thread frees into an arena of its own, of which there are eight for each core.
+    Otherwise, each large freed array raises the size, up to 32 MB, below which later arrays stay
+    with the process. A process that replays recordings of 27 MB kept 30 to 60 MB more. Each thread
+    also frees into an arena of its own, of which there are eight for each core.
     """
     with contextlib.suppress(AttributeError, OSError):
         for option, value in ((_M_MMAP_THRESHOLD, _LARGE), (_M_ARENA_MAX, _ARENAS)):
@@ -86,16 +86,15 @@ def repeatable(function: Callable[P, T]) -> Callable[P, T]:
 
 
 class ModuleProcess(subprocess.Popen[Any]):
-    """``python -m MODULE ARGUMENTS``, with numerical libraries that share no core by default.
+    """Process ``python -m MODULE ARGUMENTS`` with one thread per numerical library by default.
 
-    It runs in a session of its own: Ctrl-C reaches only the process that started it, which then
-    ends it. Its directory is ``/``, because ``-m`` prefers what lies in the current directory to
-    what is installed.
+    It runs in its own session: Ctrl-C reaches only its starter, which then ends it. Its directory
+    is ``/``, because ``-m`` prefers modules in the current directory to installed ones.
 
     Parameters
     ----------
     environment : Mapping[str, str] or None
-        None for that of this process.
+        Environment variables; None for those of this process.
     options
         Options of ``subprocess.Popen``.
     """
@@ -117,7 +116,7 @@ class ModuleProcess(subprocess.Popen[Any]):
         )
 
     def finish(self, seconds: float, number: int = signal.SIGTERM) -> int:
-        """Send a signal, and kill the process if it does not end in time; returns its exit code."""
+        """Send a signal, kill the process if it does not end in time, and return its exit code."""
         self.send_signal(number)  # does nothing to a process that has ended
         try:
             return self.wait(seconds)

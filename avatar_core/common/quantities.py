@@ -1,7 +1,7 @@
 """Dataclass fields for numbers with unit and range, and the check of their values.
 
-Own code: pydantic validates ranges, but has neither units nor these messages, which name the
-remedy; they would take as many lines on top of it.
+This is own code: pydantic validates ranges, but has neither units nor these messages, which name
+the remedy. Adding them would take as many lines on top of pydantic.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def quantity(unit: str, low: float, high: float, text: str, default: Any = MISSI
 
 
 def lies_in(value: Any, allowed: Quantity, whole: bool = False) -> bool:
-    """Return whether something is a number, or a whole one, within a range."""
+    """Return whether a value is a number, whole if asked for, within a range."""
     kinds = int if whole else (int, float)
     if not isinstance(value, kinds) or isinstance(value, bool):
         return False

@@ -1,11 +1,12 @@
 """Uniform quadratic B-splines over a grid: values, first and second derivatives at a point.
 
 f(p) = sum_ijk v_ijk B_i(x) B_j(y) B_k(z) over the 27 samples around p (de Boor, A Practical Guide
-to Splines). The sum smooths the samples a little; it is once continuously differentiable and its
-second derivatives are bounded. Several fields on one grid share the weights of a *cell*.
+to Splines). The sum smooths the samples a little. It is once continuously differentiable and its
+second derivatives are bounded. Several fields on one grid use the weights of one *cell*.
 
-A field that vanishes nearly everywhere is kept in *bricks* of ``BRICK``^3 samples where it does
-not: ``brick`` (nx, ny, nz) holds the number of each, -1 where the samples are zero.
+A field that vanishes nearly everywhere is stored in *bricks* of ``BRICK``^3 samples around its
+non-zero samples. ``brick`` (nx, ny, nz) holds the number of each brick, -1 where the samples are
+zero.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ _SHIFT, _LAST = 3, 7
 
 @inlined
 def on_grid(shape, origin, spacing, p):  # type: ignore[no-untyped-def]
-    """Whether all 27 samples around p exist (never for a p that is not finite)."""
+    """Return whether all 27 samples around p exist; False for a p that is not finite."""
     for d in range(3):
         middle = np.floor((p[d] - origin[d]) / spacing + 0.5)
         if not 1.0 <= middle < shape[d] - 1.0:
@@ -30,7 +31,7 @@ def on_grid(shape, origin, spacing, p):  # type: ignore[no-untyped-def]
 
 @inlined
 def cell_at(origin, spacing, p):  # type: ignore[no-untyped-def]
-    """Where a p that is :func:`on_grid` lies.
+    """Return the cell of a p that is :func:`on_grid`.
 
     Returns
     -------
@@ -50,7 +51,7 @@ def cell_at(origin, spacing, p):  # type: ignore[no-untyped-def]
 
 @fast
 def _weights(t):  # type: ignore[no-untyped-def]
-    """At t in [-1/2, 1/2) from the middle sample."""
+    """Return the three weights at t in [-1/2, 1/2) from the middle sample."""
     return (0.5 * (0.5 - t) ** 2, 0.75 - t * t, 0.5 * (0.5 + t) ** 2)
 
 
@@ -61,7 +62,7 @@ def _slopes(t, scale):  # type: ignore[no-untyped-def]
 
 @fast
 def in_cell(values, cell, gradient):  # type: ignore[no-untyped-def]
-    """Value of a sampled field; its gradient [1/m] into ``gradient``."""
+    """Return the value of a sampled field; write its gradient [1/m] to ``gradient``."""
     (nx, ny, nz), (wx, wy, wz), (dx, dy, dz) = cell
     value = g0 = g1 = g2 = 0.0
     for i in range(3):
@@ -82,7 +83,7 @@ def in_cell(values, cell, gradient):  # type: ignore[no-untyped-def]
 
 @inlined
 def value_in_cell(values, cell):  # type: ignore[no-untyped-def]
-    """Value of a sampled field; NaN where a sample is."""
+    """Return the value of a sampled field; NaN if one of its samples is NaN."""
     (nx, ny, nz), (wx, wy, wz), _ = cell
     value = 0.0
     for i in range(3):
@@ -94,7 +95,7 @@ def value_in_cell(values, cell):  # type: ignore[no-untyped-def]
 
 @fast
 def second_derivatives(values, cell, spacing, hessian):  # type: ignore[no-untyped-def]
-    """Second derivatives [1/m^2] of a sampled field, into (3, 3)."""
+    """Write the second derivatives [1/m^2] of a sampled field to ``hessian``, shape (3, 3)."""
     (nx, ny, nz), (wx, wy, wz), (dx, dy, dz) = cell
     end = 1.0 / (spacing * spacing)
     curve = (end, -2.0 * end, end)
@@ -118,7 +119,7 @@ def second_derivatives(values, cell, spacing, hessian):  # type: ignore[no-untyp
 
 @fast
 def add_in_bricks(brick, values, cell, gradient):  # type: ignore[no-untyped-def]
-    """Value of a field in bricks; its gradient [1/m] is added to ``gradient``.
+    """Return the value of a field in bricks; add its gradient [1/m] to ``gradient``.
 
     Parameters
     ----------
@@ -140,7 +141,7 @@ def add_in_bricks(brick, values, cell, gradient):  # type: ignore[no-untyped-def
 
 @fast
 def _in_brick(brick, values, i, j, k):  # type: ignore[no-untyped-def]
-    """A sample of a field in bricks."""
+    """Return a sample of a field in bricks."""
     b = brick[i >> _SHIFT, j >> _SHIFT, k >> _SHIFT]
     return values[b, i & _LAST, j & _LAST, k & _LAST] if b >= 0 else 0.0
 
@@ -152,7 +153,7 @@ def _line(values, i, j, k):  # type: ignore[no-untyped-def]
 
 @entry
 def evaluate(values, origin, spacing, p, gradient, outside):  # type: ignore[no-untyped-def]
-    """Value of a sampled field at p, its gradient into ``gradient``; off the grid ``outside``."""
+    """Return a sampled field at p, its gradient into ``gradient``; ``outside`` off the grid."""
     if not on_grid(values.shape, origin, spacing, p):
         gradient[0] = gradient[1] = gradient[2] = 0.0
         return outside
@@ -161,7 +162,7 @@ def evaluate(values, origin, spacing, p, gradient, outside):  # type: ignore[no-
 
 @entry
 def evaluate_all(values, origin, spacing, points, out, gradients):  # type: ignore[no-untyped-def]
-    """Of a sampled field at points (n, 3): values into (n,), gradients into (n, 3).
+    """Evaluate a sampled field at points (n, 3): values into (n,), gradients into (n, 3).
 
     Off the grid they are zero.
     """

@@ -24,14 +24,14 @@ _DEGREE = 5  # of the quadrature, 3 x 3 points
 
 
 class AxisymmetricBody:
-    """A cylinder of r, -z <= ``ticks[-1]``, clamped at its side and its bottom.
+    """A cylinder r <= ``ticks[-1]``, -z <= ``ticks[-1]``, clamped at its side and its bottom.
 
-    Displacements have the shape (n_nodes, 2), of (u_r, u_z); forces (2 n_nodes,).
+    Displacements (u_r, u_z) have the shape (n_nodes, 2), forces (2 n_nodes,).
 
     Parameters
     ----------
     ticks : ndarray
-        Rising from 0, of the edges of the elements along r and along -z.
+        Edges of the elements along r and along -z, rising from 0.
     material : HyperelasticMaterial
 
     Attributes
@@ -39,10 +39,13 @@ class AxisymmetricBody:
     places : ndarray, shape (n_nodes, 2)
         r and z of the nodes.
     free : ndarray
-        Degrees of freedom that clamp and axis leave.
-    top, top_shape, top_radius, top_area
-        Top, top shape, top radius and top area of the surface z = 0: nodes (n_edges, 9), values of
-        their shape functions (n_edges, n_points, 9), r and 2 pi r dr (n_edges, n_points).
+        Degrees of freedom that are neither clamped nor on the axis.
+    top : ndarray of int, shape (n_edges, 9)
+        Nodes of the elements at the surface z = 0.
+    top_shape : ndarray, shape (n_edges, n_points, 9)
+        Values of their shape functions at the quadrature points of the surface.
+    top_radius, top_area : ndarray, shape (n_edges, n_points)
+        r and 2 pi r dr at these points.
     """
 
     def __init__(self, ticks: np.ndarray, material: HyperelasticMaterial) -> None:
@@ -70,7 +73,7 @@ class AxisymmetricBody:
         return len(self.places)
 
     def deformation_gradient(self, u: np.ndarray) -> np.ndarray:
-        """Return the f, shape (n_elements, 9, 3, 3)."""
+        """Return F, shape (n_elements, 9, 3, 3)."""
         local = u[self.nodes].reshape(len(self.nodes), -1)
         F = np.zeros((*self.volume.shape, 3, 3))
         F[..., _ROW, _COLUMN] = np.einsum("eqak,ea->eqk", self._strain, local)
@@ -100,7 +103,10 @@ class AxisymmetricBody:
 
         Parameters
         ----------
-        surface : ndarray, shape (n_edges, 18, 18), what the surface adds to it
+        u : ndarray, shape (n_nodes, 2)
+            Displacement.
+        surface : ndarray, shape (n_edges, 18, 18)
+            Matrices that the surface adds to the tangent.
         """
         A = self.material.tangent(self.deformation_gradient(u))
         A = A[..., _ROW[:, None], _COLUMN[:, None], _ROW, _COLUMN] * self.volume[..., None, None]
@@ -112,7 +118,7 @@ class AxisymmetricBody:
         return self._analysis.factor(self._assembled(np.concatenate([inner, surface])).data)
 
     def _lower_triangle(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Which entries of the element matrices count, and their rows and columns."""
+        """Return which entries of the element matrices count, and their rows and columns."""
         number = np.full(2 * self.n_nodes, -1)
         number[self.free] = np.arange(len(self.free))
         dofs = number[_dofs(np.concatenate([self.nodes, self.top])).reshape(-1, 18)]
@@ -121,14 +127,14 @@ class AxisymmetricBody:
         return kept, row[kept], column[kept]
 
     def _assembled(self, blocks: np.ndarray) -> sp.csc_matrix:
-        """Sum of the element matrices (n, 18, 18), first of the body, then of its surface."""
+        """Return sum of the element matrices (n, 18, 18), first the body's, then its surface's."""
         kept, row, column = self._entries
         n = len(self.free)
         return sp.csc_matrix((blocks[kept], (row, column)), shape=(n, n))
 
 
 def _dofs(nodes: np.ndarray) -> np.ndarray:
-    """Return (..., n, 2), those of u_r and u_z of each node."""
+    """Return the degrees of freedom (..., n, 2) of u_r and u_z of each node."""
     return 2 * nodes[..., None] + np.arange(2)
 
 
@@ -137,7 +143,10 @@ def _on_top(x: np.ndarray) -> np.ndarray:
 
 
 def _strains(basis: Basis) -> tuple[np.ndarray, np.ndarray]:
-    """dF / du (n_elements, n_points, 18, 5) over ``_ROW`` and ``_COLUMN``, and 2 pi r dr dz."""
+    """Return dF / du over ``_ROW`` and ``_COLUMN``, and 2 pi r dr dz.
+
+    dF / du has the shape (n_elements, n_points, 18, 5).
+    """
     r = basis.global_coordinates()[0]
     strain = np.zeros((*r.shape, 18, 5))
     for a, shape in enumerate(basis.basis):

@@ -1,8 +1,8 @@
-"""A disc of the surface that moves rigidly with what is bonded to it, by finite elements.
+"""A disc bonded to the surface, which moves rigidly, by finite elements.
 
-The nodes of the surface within the disc are displaced alike. With the responses U = K^-1 L to unit
-forces L at them, their forces are (L^T U)^-1 R for the translations R, and the organ moves by U
-times these.
+The surface nodes within the disc have the same displacement. Let U = K^-1 L be the responses to
+unit forces L at these nodes, and R the translations. The nodal forces are then (L^T U)^-1 R, and
+the organ moves by U times these forces.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class BondedDisc:
     Attributes
     ----------
     stiffness : ndarray, shape (3, 3)
-        Stiffness [N/m], force on the organ by displacement of the disc.
+        Force on the organ per displacement of the disc [N/m].
     displacement : ndarray, shape (n_vertices, 3, 3)
-        Displacement [-], of each vertex by each translation.
+        Displacement of each vertex per translation of the disc [-].
     n_nodes : int
-        n nodes of the disc.
+        Number of nodes in the disc.
     """
 
     stiffness: FloatArray
@@ -47,16 +47,18 @@ def bonded_disc(
     Parameters
     ----------
     elasticity : Elasticity
-        The organ, refined there.
-    place, normal : ndarray, shape (3,)
-        Place and normal [m], of the surface.
+        Problem of the organ, on a mesh refined at the place.
+    place : ndarray, shape (3,)
+        Centre of the disc [m].
+    normal : ndarray, shape (3,)
+        Unit normal of the surface.
     radius : float
-        Radius [m], along the surface.
+        Radius along the surface [m].
 
     Raises
     ------
     ContactError
-        If the mesh has too few nodes there, or the clamp is among them.
+        If the mesh has too few nodes in the disc, or the clamp is among them.
     """
     nodes, at = surface_nodes(elasticity)
     arm = at - place
@@ -84,7 +86,7 @@ def bonded_disc(
 
 
 def surface_nodes(elasticity: Elasticity) -> tuple[FloatArray, FloatArray]:
-    """Return the nodes of the surface, and where they are (n, 3) [m]."""
+    """Return the nodes of the surface, and their positions (n, 3) [m]."""
     mesh, of_faces = elasticity.mesh, elasticity.face_nodes
     corners = mesh.vertices[mesh.boundary_faces]
     middles = (corners + np.roll(corners, -1, axis=1)) / 2.0

@@ -4,15 +4,16 @@ The weak form (paper Eq. 4 without the load coordinate): find u in H1_0 with
 
     int_Omega 2 mu eps(u):eps(v) + lambda div(u) div(v) dx = int_Gamma t . v da   for all v.
 
-Quadratic tetrahedra (P2) serve up to nu = 0.49. Above, the Taylor-Hood pair (P2 displacement, P1
-pressure) replaces lambda div(u) by a pressure p with int (div u - p / lambda) q dx = 0.
-Linear tetrahedra (P1) lock at the nu of liver (compliance 0.72 of the true one at 0.48): they
-are there for timing very large meshes, never as a default.
+Quadratic tetrahedra (P2) are used up to nu = 0.49. Above, the Taylor-Hood pair (P2 displacement, P1
+pressure) replaces lambda div(u) by a pressure p with int (div u - p / lambda) q dx = 0. Linear
+tetrahedra (P1) lock at the nu of liver: at 0.48 their compliance is 0.72 of the true one. They are
+there for timing very large meshes, never as a default.
 
-With an inclusion, a tumour say, Young's modulus is (1 + (c - 1) chi) E, with the contrast c and the
-volume fraction chi of each tetrahedron inside. The stiffness is then affine in mu, lambda, c mu and
-c lambda, in the stiffness of every support (:mod:`avatar_core.fem.supports`) and of every strip of
-a cut (:mod:`avatar_core.fem.resection`), of which the coordinates of a vademecum make use.
+With an inclusion, e.g. a tumour, Young's modulus is (1 + (c - 1) chi) E. The contrast is c, and chi
+is the volume fraction of each tetrahedron inside. The stiffness is then affine in mu, lambda, c mu
+and c lambda, which the coordinates of a vademecum use. It is also affine in the stiffness of every
+support (:mod:`avatar_core.fem.supports`) and of every strip of a cut
+(:mod:`avatar_core.fem.resection`).
 """
 
 from __future__ import annotations
@@ -89,7 +90,10 @@ def factors_at(
     supports: Sequence[Support] = (),
     resection: Resection | None = None,
 ) -> np.ndarray:
-    """theta_q of K = sum_q theta_q K_q: mu, lambda; c mu, c lambda with an inclusion; each k."""
+    """Return theta_q of K = sum_q theta_q K_q.
+
+    The factors are mu and lambda, with an inclusion c mu and c lambda, then each spring's k.
+    """
     lam, mu = material.lame
     theta = [mu, lam] if contrast is None else [mu, lam, contrast * mu, contrast * lam]
     ties = () if resection is None else resection.factors
@@ -103,7 +107,7 @@ class Inclusion:
     Attributes
     ----------
     volume_fraction : ndarray, shape (n_tets,)
-        Chi, of each tetrahedron inside.
+        chi, the volume fraction of each tetrahedron inside.
     contrast : float
         Young's modulus inside over that outside, c > 0.
     """
@@ -129,7 +133,7 @@ class Elasticity:
     mesh : TetMesh
     material : Material
     clamped : ndarray of bool, shape (n_faces,)
-        Over ``mesh.boundary_faces``; all False and no supports leave the organ free: then only
+        Mask over ``mesh.boundary_faces``. Without clamp and supports the organ is free, and only
         :attr:`stiffness` can be used.
     element : Element or None
         "P1", "P2", "Taylor-Hood" or None for ``material.element``.
@@ -138,7 +142,7 @@ class Elasticity:
     supports : Sequence[Support]
         Springs beside the clamp; where two overlap, both act.
     resection : Resection or None
-        How far the cut of the mesh is opened; None for a mesh without one.
+        Opening of the mesh's cut; None for a mesh without a cut.
 
     Raises
     ------
@@ -177,7 +181,10 @@ class Elasticity:
         self.clamped_nodes = np.unique(self.face_nodes[clamped])
 
     def refined(self) -> Elasticity:
-        """The same problem with every tetrahedron split into eight; vertices keep their numbers."""
+        """Return the same problem with every tetrahedron split into eight.
+
+        Vertices keep their numbers.
+        """
         fine = self._skfem_mesh.refined(1)
         tets = fine.t.T.copy()
         turned = TetMesh(fine.p.T, tets).tet_volumes < 0
@@ -212,14 +219,17 @@ class Elasticity:
         stiffness: Mapping[str, float] | None = None,
         opened: float | None = None,
     ) -> Elasticity:
-        """Return the same problem and element at other values; matrices are shared.
+        """Return the same problem and element at other values, with the same matrices.
 
         Parameters
         ----------
+        material : Material
+        contrast : float or None
+            Contrast of the inclusion.
         stiffness : Mapping[str, float] or None
             Stiffness of supports, by name [N/m^3]; those not given keep theirs.
         opened : float or None
-            Opened of the cut, 0 to 1.
+            Opening of the cut, 0 to 1.
         """
         other = copy(self)
         other.material = material
@@ -238,13 +248,13 @@ class Elasticity:
 
     @property
     def factors(self) -> np.ndarray:
-        """theta_q at this problem's material, :func:`factors_at`."""
+        """Factors theta_q at this problem's material, :func:`factors_at`."""
         contrast = self.inclusion.contrast if self.inclusion else None
         return factors_at(self.material, contrast, self.supports, self.resection)
 
     @property
     def n_material(self) -> int:
-        """How many of :attr:`factors` are the material's; those of springs follow."""
+        """Number of :attr:`factors` of the material; the factors of springs follow."""
         return 2 if self.inclusion is None else 4
 
     @cached_property
@@ -268,7 +278,7 @@ class Elasticity:
         return sum((stiffness * mass for stiffness, mass in springs), shear).tocsr()
 
     def apply_term(self, q: int, displacement: np.ndarray) -> np.ndarray:
-        """Return K_q u of one of :attr:`factors`, shape (3 n_nodes, n) [m^2], of springs [m^3]."""
+        """Return K_q u of one of :attr:`factors`, (3 n_nodes, n): [m^2], for springs [m^3]."""
         if q >= self.n_material:
             return np.asarray(self._terms.spring_mass[q - self.n_material] @ displacement)
         if self.element != "Taylor-Hood":
@@ -294,7 +304,7 @@ class Elasticity:
         return rslab.ldlt(self._system.astype(np.float32), threads=1)
 
     def factorize(self, single: bool = False) -> None:
-        """Make the factor that solutions need, before several threads ask for it at once."""
+        """Compute the factor of the system now, before several threads ask for it at once."""
         _ = self._single_factor if single or self._refines else self._factor
 
     @property
@@ -316,9 +326,9 @@ class Elasticity:
         return sp.csc_matrix(system)
 
     def _require_all_held(self) -> None:
-        """Raise if a part of the organ can move freely.
+        """Raise MaterialError or MeshError if a part of the organ can move freely.
 
-        The factorization of such a system need not fail, and loads elsewhere do not reveal it.
+        The factorization of a singular system need not fail, and loads elsewhere do not reveal it.
         """
         mesh, young = self.mesh, self.material.young_modulus
         piece = mesh.pieces[mesh.boundary_tets]
@@ -351,14 +361,15 @@ class Elasticity:
 
         Parameters
         ----------
-        loads : ndarray or sp.spmatrix, shape (3 n_nodes, n)
-            Ndarray or sparse [N].
+        loads : ndarray or sparse, shape (3 n_nodes, n)
+            Nodal forces [N].
         single : bool
-            Single in single precision, which takes half the time; see :meth:`single_error`.
+            Solve in single precision, which takes half the time; see :meth:`single_error`.
 
         Returns
         -------
-        ndarray, shape (3 n_nodes, n) [m]
+        ndarray, shape (3 n_nodes, n)
+            Displacements [m].
 
         Raises
         ------
@@ -394,9 +405,10 @@ class Elasticity:
     def refining(self) -> Elasticity:
         """Return the same problem, solved in double precision by the factor in single precision.
 
-        Each solution is refined by those for what it leaves (Langou et al., Proc. SC 2006): two or
-        three solutions in single precision instead of one in double, and no factor in double, which
-        takes twice the time and memory. Where they do not converge, there is one after all.
+        Each solution is refined by solutions for its residual (Langou et al., Proc. SC 2006). Two
+        or three solutions in single precision replace one in double precision, and no
+        double-precision factor is needed, which takes twice the time and memory. Where refinement
+        does not converge, the double-precision factor is computed after all.
         """
         if self._refines:
             return self
@@ -420,8 +432,8 @@ class Elasticity:
     def single_error(self, loads: sp.spmatrix) -> float:
         """Return the relative error of solutions in single precision, the largest of some loads.
 
-        As one step of refinement finds it: the solution for what they leave, in double precision.
-        P2 has 1e-4 at nu = 0.48 and 7e-4 at 0.49, Taylor-Hood 5e-5 at 0.495.
+        One step of refinement finds it: the solution for the residual in double precision. P2 has
+        1e-4 at nu = 0.48 and 7e-4 at 0.49, Taylor-Hood 5e-5 at 0.495.
         """
         found = self.solve(loads, single=True).astype(float)
         left = np.asarray(loads - self.apply(found))
@@ -429,7 +441,7 @@ class Elasticity:
         return float((error / np.linalg.norm(found, axis=0)).max())
 
     def single_serves(self, loads: sp.spmatrix) -> bool:
-        """Whether single precision is good enough for loads, by trying it on the first of them."""
+        """Return whether single precision is good enough for loads, by a trial on the first."""
         return self.single_error(loads.tocsc()[:, :_TRIED]) < SINGLE_ERROR
 
     def apply(self, displacement: np.ndarray) -> np.ndarray:
@@ -454,6 +466,6 @@ def _contains(triangle: np.ndarray, point: np.ndarray) -> bool:
 
 
 def _largest_ratio(change: np.ndarray, solution: np.ndarray) -> float:
-    """Of the norms of columns; zero for columns that vanish."""
+    """Return the largest ratio of the norms of columns; zero for columns that vanish."""
     part, whole = (np.linalg.norm(a.astype(float), axis=0) for a in (change, solution))
     return float((part / np.maximum(whole, 1e-300)).max(initial=0.0))

@@ -1,17 +1,17 @@
 """A tip pressed on an elastic half-space whose surface is not plane: boundary elements on rings.
 
-The surface lies H(r, theta) below the plane across the tip's axis, and the tip's lowest point d
-below that plane; the tip's own height above it is f(r). With a pressure p >= 0 that is constant on
-each sector of a few rings,
+The surface lies H(r, theta) below the plane across the tip's axis. The tip's lowest point lies d
+below that plane; the tip's own height above its lowest point is f(r). The pressure p >= 0 is
+constant on each sector of a few rings,
 
     u + H + f - d >= 0,   p >= 0,   p (u + H + f - d) = 0,      u = 1 / (pi E*) int p / |x - x'| dA
 
-(Boussinesq; Johnson, Contact Mechanics, 1985, Sec. 3.2). Such p minimises p A p / 2 + b p over
-p >= 0, which accelerated projected gradients find (Beck & Teboulle, SIAM J. Imaging Sci. 2:183,
+(Boussinesq; Johnson, Contact Mechanics, 1985, Sec. 3.2). The solution p minimises p A p / 2 + b p
+over p >= 0. Accelerated projected gradients find it (Beck & Teboulle, SIAM J. Imaging Sci. 2:183,
 2009, restarted after O'Donoghue & Candes, 2015). The heights are small and smooth at the scale of
-the contact; it is a half-space all the same.
+the contact, so that the half-space's u holds.
 
-A plane surface is met within 1 % of Sneddon's exact sphere.
+For a plane surface the result is within 1 % of Sneddon's exact sphere.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ ITERATIONS = 25  # at most, until a step moves less than
 SETTLED = np.float32(3e-4)  # of the solution: loads are then within 0.1 %
 _PARTS, _ORDER = 4, 6  # of a sector that is close, in both directions, and of its quadrature
 _RAYS = 720  # from the middle of a sector over itself
-_HALVINGS = 50  # to where such a ray leaves the sector
+_HALVINGS = 50  # to find where a ray leaves the sector
 
 
 def ring_radii() -> np.ndarray:
-    """Return the radii of the middle of each ring over that of the outermost, shape (RINGS,)."""
+    """Return the radius of each ring's middle over the outermost ring's, shape (RINGS,)."""
     return (np.arange(RINGS) + 0.5) / RINGS
 
 
@@ -49,7 +49,7 @@ def loads_on_heights(under: np.ndarray, window: np.ndarray, height: np.ndarray) 
     under : ndarray, shape (n, RINGS)
         f - d at the middles of the rings [m].
     window : ndarray, shape (n,)
-        Outer radius of the rings [m]: the tip touches inside.
+        Outer radius of the rings, inside which the tip touches [m].
     height : ndarray, shape (n, RINGS, SECTORS)
         H at the middles of the sectors [m].
     """
@@ -64,8 +64,8 @@ def loads_on_heights(under: np.ndarray, window: np.ndarray, height: np.ndarray) 
 def _problem() -> tuple[np.ndarray, np.ndarray, float]:
     """Return I - A / L, area over scale, and L, the largest eigenvalue of A.
 
-    A : energies of pressures of unit energy, the scale, with lengths in units of the window's
-        radius and E* = 1
+    A is the energy matrix of pressures, each divided by its scale so that its energy is one.
+    Lengths are in units of the window's radius and E* = 1.
     """
     area = np.repeat(((np.arange(RINGS) + 0.5) / RINGS**2) * 2.0 * np.pi / SECTORS, SECTORS)
     energy = _influence() * area[:, None]
@@ -78,7 +78,7 @@ def _problem() -> tuple[np.ndarray, np.ndarray, float]:
 
 @compiled(fastmath=True)
 def _solve(start, step, weight, load):  # type: ignore[no-untyped-def]
-    """q of least energy for each row b / L of ``start``, (n, m); sum of q times ``weight``."""
+    """Return q of least energy for each row b / L of ``start``, (n, m), and q . ``weight``."""
     m = step.shape[0]
     q, y, new = np.empty(m, np.float32), np.empty(m, np.float32), np.empty(m, np.float32)
     for row in range(start.shape[0]):
@@ -115,7 +115,10 @@ def _solve(start, step, weight, load):  # type: ignore[no-untyped-def]
 
 
 def _influence() -> np.ndarray:
-    """u at the middles of all sectors under a unit pressure on each, (m, m), outer radius 1."""
+    """Return u at the middles of all sectors under a unit pressure on each, (m, m).
+
+    The outer radius is 1.
+    """
     out = np.zeros((RINGS, SECTORS, RINGS, SECTORS))
     angle = sector_angles()
     for i, r in enumerate(ring_radii()):
@@ -144,7 +147,7 @@ def _over_sector(ring: int, middle: float, at: float) -> float:
 
 
 def _over_own(inner: float, outer: float, half: float, at: float) -> float:
-    """Return the same over the sector around x': its length along all rays from there."""
+    """Return the same integral over the sector around x': its length along all rays from there."""
     ray = 2.0 * np.pi * (np.arange(_RAYS) + 0.5) / _RAYS
     low, high = np.zeros(_RAYS), np.full(_RAYS, 2.0 * outer)
     for _ in range(_HALVINGS):

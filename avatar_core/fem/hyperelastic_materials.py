@@ -1,8 +1,8 @@
 """Hyperelastic materials: energy, stress and tangent as functions of the deformation gradient.
 
-With F = I + grad u, the first Piola stress P = d psi / dF is force per undeformed area, and the
-tangent A = dP/dF makes Newton's method quadratic. Both materials extend a linear one (Young's
-modulus, Poisson's ratio) to large strain: at F = I their tangent is Hooke's.
+With F = I + grad u, the first Piola stress P = d psi / dF is force per undeformed area. The tangent
+A = dP/dF makes Newton's method quadratic. Both materials extend a linear one (Young's modulus,
+Poisson's ratio) to large strain: at F = I their tangent is Hooke's.
 
 Source: Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2008, ch. 6.
 """
@@ -20,7 +20,7 @@ _IDENTITY = np.eye(3)
 
 
 class HyperelasticMaterial(Protocol):
-    """What the finite elements need of a material; F has the shape (..., 3, 3), det F > 0."""
+    """Interface of a material for the finite elements; F has the shape (..., 3, 3), det F > 0."""
 
     @property
     def linear(self) -> Material:
@@ -38,10 +38,10 @@ class HyperelasticMaterial(Protocol):
 
 @dataclass(frozen=True)
 class StVenantKirchhoff:
-    """psi = lambda/2 (tr E)^2 + mu E:E with Green's strain E = (F^T F - I) / 2.
+    """Energy psi = lambda/2 (tr E)^2 + mu E:E with Green's strain E = (F^T F - I) / 2.
 
-    Right for large rotations, not for large compression: a column softens below the stretch
-    1/sqrt(3) = 0.577 and costs finite energy at stretch 0. The paper's material (Sec. 2.1).
+    The material suits large rotations, not large compression. A column softens below the stretch
+    1/sqrt(3) = 0.577 and costs finite energy at stretch 0. It is the paper's material (Sec. 2.1).
     """
 
     linear: Material = field(default_factory=Material)
@@ -75,7 +75,7 @@ class StVenantKirchhoff:
 
 @dataclass(frozen=True)
 class NeoHookean:
-    """psi = mu/2 (tr F^T F - 3) - mu ln J + lambda/2 (ln J)^2, J = det F.
+    """Energy psi = mu/2 (tr F^T F - 3) - mu ln J + lambda/2 (ln J)^2, J = det F.
 
     The energy grows without bound as J goes to 0: elements resist being crushed.
     """

@@ -41,7 +41,7 @@ class Hyperelasticity:
     mesh : TetMesh
     material : HyperelasticMaterial
     clamped : ndarray of bool, shape (n_faces,)
-        Over ``mesh.boundary_faces``.
+        Mask over ``mesh.boundary_faces``.
 
     Raises
     ------
@@ -74,7 +74,7 @@ class Hyperelasticity:
 
     @cached_property
     def free(self) -> np.ndarray:
-        """Degrees of freedom that the clamp leaves, shape (n_free,)."""
+        """Degrees of freedom that are not clamped, shape (n_free,)."""
         free = np.ones((self.n_nodes, 3), bool)
         free[self.linear.clamped_nodes] = False
         return np.flatnonzero(free)
@@ -88,7 +88,7 @@ class Hyperelasticity:
         return np.eye(3) + local.transpose(0, 2, 1)[:, None] @ gradients
 
     def min_det(self, displacement: np.ndarray) -> float:
-        """Smallest det F over quadrature points and corners; negative where one is inverted."""
+        """Return least det F over quadrature points and corners; negative where one is inverted."""
         inside = determinant(self.deformation_gradient(displacement)).min()
         corners = self._deformation_gradient(displacement, self._corner_gradients)
         return float(min(inside, determinant(corners).min()))
@@ -101,7 +101,7 @@ class Hyperelasticity:
         return float((self.volumes * self.material.energy(F)).sum())
 
     def forces(self, displacement: np.ndarray) -> np.ndarray:
-        """Internal forces int P : grad v dx, shape (3 n_nodes,) [N]; reactions at the clamp."""
+        """Return internal forces int P : grad v dx, (3 n_nodes,) [N]; reactions at the clamp."""
         stress = self.material.stress(self.deformation_gradient(displacement))
         weighted = self.volumes[..., None, None] * stress
         local = (self.gradients @ weighted.transpose(0, 1, 3, 2)).sum(axis=1)
@@ -121,7 +121,10 @@ class Hyperelasticity:
         return sp.csc_matrix((data[:-1], indices, indptr), shape=(n, n))
 
     def factorize(self, tangent: sp.csc_matrix) -> rslab.Ldlt:
-        """LDL^T of a tangent; it may be indefinite: ``inertia`` counts the signs of the pivots."""
+        """Return LDL^T of a tangent, which may be indefinite.
+
+        ``inertia`` counts the pivots' signs.
+        """
         return self._analysis.factor(tangent.data)
 
     @cached_property
@@ -157,7 +160,7 @@ class Hyperelasticity:
 
 
 def _gradients(basis: Basis) -> np.ndarray:
-    """Gradients of the shape functions at its points, shape (n_tets, n_points, 10, 3) [1/m]."""
+    """Return gradients of the shape functions, shape (n_tets, n_points, 10, 3) [1/m]."""
     gradients = np.stack([shape[0].grad for shape in basis.basis])  # (10, 3, element, point)
     return np.ascontiguousarray(gradients.transpose(2, 3, 0, 1))
 

@@ -1,19 +1,19 @@
 """Stable equilibria at large deformation: Newton's method as a descent of the energy.
 
-:func:`solve` carries a given dead load, :func:`press` pushes a load's patch to given depths. Both
+:func:`solve` carries a given dead load; :func:`press` pushes a load's patch to given depths. Both
 march in steps that halve where Newton fails and double where it is quick, and minimise
 
     Pi(u) = int psi dx - f . u    over all u (solve), over those with C^T u = depth n (press).
 
-Under an imposed motion of the patch the force is the multiplier of the constraint; states are found
-that a growing force would skip by snapping through. Where no step lowers the energy without
-turning an element inside out, where the tangent is not positive definite, or where the state found
-is far from the one that the tangent predicted however small the step, equilibrium is lost.
+Under an imposed motion of the patch, the force is the multiplier of the constraint. This finds
+states that a growing force would skip by snapping through. Equilibrium is lost in three cases. No
+step lowers the energy without turning an element inside out. The tangent is not positive definite.
+Or the state found is far from the tangent's prediction, however small the step.
 
-Newton's systems are solved by conjugate gradients, preconditioned by the LDL^T factor of an
-earlier tangent: a factor costs as much as some 50 iterations. (Nocedal and Wright, Numerical
-Optimization, 2006: Alg. 3.1 for the line search, Alg. 7.1 for truncated Newton steps, here refused
-at negative curvature, and Alg. 16.2 for the projection onto the constraint.)
+Newton's systems are solved by conjugate gradients, preconditioned by the LDL^T factor of an earlier
+tangent: a factor costs as much as some 50 iterations. Source: Nocedal and Wright, Numerical
+Optimization, 2006. Alg. 3.1 is the line search, Alg. 7.1 the truncated Newton step, here refused at
+negative curvature, and Alg. 16.2 the projection onto the constraint.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ _PREDICTED = 1e-2  # accuracy of the tangent that predicts the next state
 
 @dataclass(frozen=True)
 class NewtonRule:
-    """When to stop, and how to step.
+    """Tolerances and step sizes of Newton's method.
 
     Attributes
     ----------
     tolerance : float
         Tolerance of the residual over the load, 2-norms over the free degrees of freedom.
     max_iterations : int
-        Max iterations of Newton's method in one load step.
+        Largest number of Newton iterations in one load step.
     first_step, least_step : float
         Fractions of the whole load or depth.
     exact_stability : bool
-        Count the negative pivots at every state returned (a factorization each); without it,
-        instability is noticed only where the conjugate gradients meet it.
+        Count the negative pivots at every state returned, at the cost of a factorization each.
+        Otherwise instability is noticed only where the conjugate gradients meet it.
     """
 
     tolerance: float = 1e-6
@@ -72,7 +72,7 @@ class State:
     displacement : ndarray, shape (3 n_nodes,)
         Displacement [m].
     force : ndarray, shape (n_loads,)
-        Factors of the loads given; [N] for unit loads.
+        Factors of the given loads; [N] for unit loads.
     depth : float
         Depth of the patch, for :func:`press` [m].
     residuals : ndarray, shape (n_iterations + 1,)
@@ -80,7 +80,7 @@ class State:
     min_det : float
         Smallest det F over quadrature points and corners of the elements.
     newton_iterations : int
-        All that were made since the state before, load steps that failed included.
+        Number of iterations since the state before, load steps that failed included.
     """
 
     displacement: np.ndarray
@@ -97,8 +97,10 @@ def solve(problem: Hyperelasticity, load: np.ndarray, rule: NewtonRule | None = 
     Parameters
     ----------
     problem : Hyperelasticity
-    load : ndarray, shape (3 n_nodes,) [N]
-    rule : NewtonRule
+    load : ndarray, shape (3 n_nodes,)
+        Dead load [N].
+    rule : NewtonRule or None
+        Tolerances and step sizes.
 
     Raises
     ------
@@ -118,27 +120,28 @@ def press(
     preload: np.ndarray | None = None,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> Iterator[State]:
-    """The equilibria of a patch that is moved to increasing depths, as by a tool that holds it.
+    """Yield equilibria of a patch that is moved to increasing depths, like by a tool that holds it.
 
-    With all three directions of the patch the mean displacement is imposed, and the patch cannot
-    tip over sideways, as it does under a dead load; with the normal alone it is free to slide.
+    With all three directions of the patch, its mean displacement is imposed. The patch then cannot
+    tip over sideways, unlike under a dead load. With the normal direction alone it is free to
+    slide.
 
     Parameters
     ----------
     problem : Hyperelasticity
     loads : ndarray, shape (3 n_nodes, m)
         C, unit loads of the patch: columns of ``patch_loads``, or combinations of them.
-        ``State.force`` are their factors [N].
+        ``State.force`` holds their factors [N].
     motion : ndarray, shape (m,)
         n: C^T u = depth n.
     depths : Sequence[float]
         Increasing and positive [m].
     rule : NewtonRule or None
-        NewtonRule.
+        Tolerances and step sizes.
     preload : ndarray, shape (3 n_nodes,)
-        A dead load such as weight, carried before and during the push; depths count from there.
+        A dead load, e.g. weight, carried before and during the push; depths count from there.
     progress : Callable[[float], None]
-        Called with the fraction of the last depth that is reached, at every Newton iteration.
+        Called at every Newton iteration with the fraction of the last depth that is reached.
 
     Raises
     ------
@@ -209,9 +212,10 @@ class _LostError(Exception):
 class _Newton(ABC):
     """Newton's method along one load.
 
-    load : ndarray, shape (n_free,), dead
+    load : ndarray, shape (n_free,), dead load
     held : ndarray, shape (n_free, m), C of the constraint C^T u = const, or None
-    iterations : a counter; on_iteration : called at each
+    iterations : counter of iterations
+    on_iteration : called at each iteration
     """
 
     quantity: str
@@ -234,7 +238,7 @@ class _Newton(ABC):
 
     @abstractmethod
     def _coordinate(self, state: State) -> float:
-        """What is marched along: the load factor or the depth."""
+        """Return the coordinate of the march: the load factor or the depth."""
 
     @abstractmethod
     def _slope(self, u: np.ndarray) -> np.ndarray:
@@ -242,10 +246,10 @@ class _Newton(ABC):
 
     @abstractmethod
     def _dead_load(self, aim: float) -> np.ndarray:
-        """Return the load that is given, shape (n_free,) [N]; zero where it is a multiplier."""
+        """Return the dead load, shape (n_free,) [N]; zero where the load is a multiplier."""
 
     def advance(self, state: State, aim: float) -> State:
-        """The equilibrium at the next coordinate, from u + (aim - coordinate) du/d(coordinate)."""
+        """Return the next equilibrium, started from u + (aim - coordinate) du/d(coordinate)."""
         free = self.problem.free
         step = (aim - self._coordinate(state)) * self._slope(state.displacement)
         start = state.displacement.copy()
@@ -261,7 +265,7 @@ class _Newton(ABC):
         return new
 
     def _state(self, u: np.ndarray, aim: float, residuals: list[float]) -> State:
-        """Return the state that was aimed at; multipliers replace the load factor."""
+        """Return the state at the target; multipliers replace the load factor."""
         free, force, depth = self.problem.free, np.array([aim]), 0.0
         if self.held is not None:
             force, depth = self._multipliers(self.problem.forces(u)[free] - self.load), aim
@@ -269,7 +273,7 @@ class _Newton(ABC):
         return State(u, force, depth, np.array(residuals), det, self.iterations)
 
     def check_stability(self, state: State) -> None:
-        """Refuse a state whose tangent has a negative direction among those that are free."""
+        """Refuse a state whose tangent has a negative direction among the free ones."""
         factor = self._factorize(self.problem.tangent(state.displacement))
         _, negative, zero = factor.inertia
         if negative + zero == 0:
@@ -278,7 +282,7 @@ class _Newton(ABC):
             raise _LostError(f"nothing resists {negative + zero} ways to deform it further")
 
     def _taken_by_constraint(self, factor: rslab.Ldlt) -> int:
-        """Return the negative directions that the constraint takes away: those of C^T K^-1 C."""
+        """Return number of negative directions that the constraint removes: those of C^T K^-1 C."""
         if self.held is None:
             return 0
         compliance = self.held.T @ factor.solve_many(np.asfortranarray(self.held))
@@ -291,14 +295,14 @@ class _Newton(ABC):
             raise _LostError("the tangent is singular") from error
 
     def _use(self, factor: rslab.Ldlt) -> None:
-        """Precondition with a factor, of a positive definite tangent, from now on."""
+        """Use the factor of a positive definite tangent as preconditioner from now on."""
         self._factor, self._stale = factor, False
         if self.held is not None:
             slope = factor.solve_many(np.asfortranarray(self.held))
             self._unit_slopes = slope @ np.linalg.inv(self.held.T @ slope)
 
     def _precondition(self, residual: np.ndarray) -> np.ndarray:
-        """Return M^-1 r, without what would change C^T u."""
+        """Return M^-1 r, projected so that C^T u does not change."""
         direction = self._factor.solve(residual)
         if self.held is not None:
             direction -= self._unit_slopes @ (self.held.T @ direction)
@@ -310,7 +314,7 @@ class _Newton(ABC):
         return np.linalg.solve(self.held.T @ self.held, self.held.T @ gradient)
 
     def _gradient(self, u: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, float]:
-        """d Pi / du along the constraint, and its norm over that of the load, shape (n_free,)."""
+        """Return d Pi / du along the constraint, (n_free,), and its norm over the load's norm."""
         gradient = self.problem.forces(u)[self.problem.free] - load
         if self.held is None:
             return gradient, float(np.linalg.norm(gradient) / np.linalg.norm(load))
@@ -338,7 +342,7 @@ class _Newton(ABC):
     def _line_search(
         self, u: np.ndarray, load: np.ndarray, gradient: np.ndarray, direction: np.ndarray
     ) -> np.ndarray:
-        """The first of u + s, u + s/2, u + s/4, ... that lowers the energy enough (Armijo)."""
+        """Return first of u + s, u + s/2, u + s/4, ... that lowers the energy enough (Armijo)."""
         free = self.problem.free
         start = self.problem.energy(u)
         slope = float(gradient @ direction)
@@ -358,8 +362,8 @@ class _Newton(ABC):
     ) -> np.ndarray:
         """Return K^-1 r in the free directions, by projected conjugate gradients.
 
-        After ``_MOST_INNER`` iterations the direction is inexact but still one of descent; the
-        line search and the residual of Newton's method decide what it is worth.
+        After ``_MOST_INNER`` iterations the direction is inexact but still a descent direction. The
+        line search and the residual of Newton's method decide whether it is used.
 
         forcing : reduction of the residual r . M^-1 r, as a norm
         enough : r . M^-1 r [J] that is small whatever it was at the start
@@ -407,7 +411,7 @@ class _LoadControl(_Newton):
 
 
 class _DepthControl(_Newton):
-    """Equilibria of an imposed motion of the patch; the forces are what that takes."""
+    """Equilibria of an imposed motion of the patch; the forces are its multipliers."""
 
     quantity = "depth [m]"
 
@@ -424,7 +428,7 @@ class _DepthControl(_Newton):
         return self.load
 
     def _slope(self, u: np.ndarray) -> np.ndarray:
-        """Return the s with C^T s = n of least s . K s."""
+        """Return s with C^T s = n of least s . K s."""
         tangent = self.problem.tangent(u)
         start = self._unit_slopes @ self._motion
         force = _times(tangent, start)
@@ -434,5 +438,5 @@ class _DepthControl(_Newton):
 
 
 def _times(lower: sp.csc_matrix, vector: np.ndarray) -> np.ndarray:
-    """Return the product with a symmetric matrix of which the lower triangle is stored."""
+    """Return the product with a symmetric matrix whose lower triangle is stored."""
     return lower @ vector + lower.T @ vector - lower.diagonal() * vector

@@ -1,5 +1,7 @@
-"""The L2 norm of displacement over an organ, by lumped masses, |u|^2 = sum_i m_i u_i^2, its mean
-strain, and orthonormality in any inner product.
+"""Norms of displacement over an organ, its mean strain, and orthonormality checks.
+
+The L2 norm uses lumped masses: |u|^2 = sum_i m_i u_i^2. Orthonormality is checked in any inner
+product.
 """
 
 from __future__ import annotations
@@ -29,15 +31,16 @@ def l2_norm(field: FloatArray, mass: FloatArray) -> NDArray[np.float64]:
 
 
 def relative_l2(estimate: FloatArray, truth: FloatArray, mass: FloatArray) -> NDArray[np.float64]:
-    """Return |u - u_ref| / |u_ref| of each column; arguments as of :func:`l2_norm`."""
+    """Return |u - u_ref| / |u_ref| of each column; arguments like :func:`l2_norm`."""
     return l2_norm(estimate - truth, mass) / l2_norm(truth, mass)
 
 
 def mean_strain(mesh: TetMesh, displacement: FloatArray) -> float:
-    """Return root mean square of the strain |sym grad u| over an organ, (int |eps|^2 dx / V)^(1/2).
+    """Return the root mean square strain of an organ, (int |sym grad u|^2 dx / V)^(1/2).
 
     Parameters
     ----------
+    mesh : TetMesh
     displacement : ndarray, shape (n_vertices, 3)
         Displacement [m], linear in each tetrahedron.
     """
@@ -77,9 +80,9 @@ def require_orthonormal(
     functions : ndarray, shape (n, rank)
         X.
     images : ndarray, shape (n, m)
-        A X' for the last m functions; A a stiffness or a mass.
+        A X' for the last m functions, with A a stiffness or a mass.
     what : str
-        Names the functions in the error.
+        Name of the functions in the error.
 
     Raises
     ------

@@ -1,16 +1,16 @@
-"""Where a tool may press: load positions, patch tractions and their conjugate displacements.
+"""Load positions, patch tractions and their conjugate displacements.
 
-A tool tip presses through a *patch*: a traction of unit total force, spread over the surface
-around its centre s by the compact profile
+A tool tip presses through a *patch*: a traction of unit total force, spread over the surface around
+its centre s by the compact profile
 
-    psi_s(x) = c (1 - |x - s|^2 / R^2)^2 max(0, n(x) . n_s),   |x - s| < R,   int psi_s da = 1,
+    psi_s(x) = c (1 - |x - s|^2 / R^2)^2 max(0, n(x) . n_s),   |x - s| < R,   int psi_s da = 1.
 
-n_s being the mean normal of the surface within R, and R a physical length, so that refining the
-mesh does not change the load. The displacement conjugate to it is the average
-u_bar(s) = int psi_s u da: force times u_bar is work.
+Here n_s is the mean normal of the surface within R. R is a physical length, so that refining the
+mesh does not change the load. The conjugate displacement is the average u_bar(s) = int psi_s u da:
+force times u_bar is work.
 
 Positions s are the vertices of the accessible faces and, where these are coarse against R, their
-edge midpoints; between them everything that depends on s is interpolated.
+edge midpoints. Between positions, everything that depends on s is interpolated.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class SurfacePoint:
     Attributes
     ----------
     positions, weights : ndarray, shape (n,)
-        The load positions that carry it.
+        Load positions that interpolate the point, and their weights.
     point : ndarray, shape (3,)
         Point [m].
     normal : ndarray, shape (3,)
@@ -65,7 +65,7 @@ class LoadSurface:
     Attributes
     ----------
     centers : ndarray, shape (n_positions, 3)
-        Centers [m], patch centres.
+        Patch centres [m].
     normals : ndarray, shape (n_positions, 3)
         Normals of the patches, :func:`patch_normals`.
     corners : ndarray of int, shape (n_triangles, 3)
@@ -93,19 +93,20 @@ class LoadSurface:
         return self.centers[self.corners].mean(axis=1)
 
     def largest_apart(self, values: np.ndarray, n: int, distance: float) -> np.ndarray:
-        """Positions of the largest values above zero, not nearer to one another than a distance.
+        """Return positions of the largest positive values that lie at least a distance apart.
 
         Parameters
         ----------
         values : ndarray, shape (n_positions,)
         n : int
-            Number of positions at most.
+            Largest number of positions.
         distance : float
-            Distance [m].
+            Least distance between two positions [m].
 
         Returns
         -------
-        ndarray of int, the largest first
+        ndarray of int
+            Positions, the largest value first.
         """
         left = values.copy()
         chosen: list[int] = []
@@ -128,7 +129,7 @@ class LoadSurface:
 
     @cached_property
     def face_positions(self) -> np.ndarray:
-        """Positions that carry each face: corners, then midpoints of edges 01, 12, 20, if any."""
+        """Load positions of each face: corners, then midpoints of edges 01, 12, 20, if any."""
         n_corners = len(self.vertices)
         if self.n_positions == n_corners:
             return self.corners
@@ -137,10 +138,10 @@ class LoadSurface:
         return np.concatenate([self.corners, n_corners + number.reshape(-1, 3)], axis=1)
 
     def weights(self, faces: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Load positions and interpolation weights at points of some faces, each (n, 3 or 6).
+        """Return load positions and interpolation weights at points of some faces, (n, 3 or 6) each.
 
-        Quadratic where the edges have midpoints, linear where they do not; one at a position
-        itself, zero at the others.
+        Interpolation is quadratic where the edges have midpoints, else linear. A position has
+        weight one at itself and zero at the others.
 
         Parameters
         ----------
@@ -193,12 +194,12 @@ def default_patch_radius(mesh: TetMesh, regions: Regions) -> float:
 
 
 def load_surface(mesh: TetMesh, regions: Regions, patch_radius: float | None = None) -> LoadSurface:
-    """Load positions of the accessible region.
+    """Return the load positions of the accessible region.
 
     Raises
     ------
     MeshError
-        If the patch radius is not a length that the surface can resolve, or no face has room.
+        If the surface cannot resolve the patch radius, or no face has room for a patch.
     """
     if patch_radius is None:
         patch_radius = default_patch_radius(mesh, regions)
@@ -227,7 +228,7 @@ def load_surface(mesh: TetMesh, regions: Regions, patch_radius: float | None = N
 
 
 def _open_faces(mesh: TetMesh, faces: np.ndarray, radius: float) -> np.ndarray:
-    """The faces where a patch has room: not the walls of fissures and flaps much thinner than R.
+    """Return the faces where a patch has room: no walls of fissures, no flaps much thinner than R.
 
     There the surface looks every way within R, so that no patch has a normal.
     """
@@ -240,17 +241,21 @@ def _open_faces(mesh: TetMesh, faces: np.ndarray, radius: float) -> np.ndarray:
 def patch_normals(mesh: TetMesh, centers: np.ndarray, radius: float) -> np.ndarray:
     """Return the normals of patches: the mean surface normal within R, weighted like the traction.
 
-    n_s ~ int (1 - |x - s|^2 / R^2)^2 n da. It turns smoothly with s where the faces do not, which
-    makes everything that depends on s smooth enough to be interpolated.
+    n_s ~ int (1 - |x - s|^2 / R^2)^2 n da. It turns smoothly with s, unlike the faces. Everything
+    that depends on s is then smooth enough to be interpolated.
 
     Parameters
     ----------
+    mesh : TetMesh
     centers : ndarray, shape (n, 3)
-        Centers [m].
+        Patch centres [m].
+    radius : float
+        R [m].
 
     Returns
     -------
-    ndarray, shape (n, 3), unit vectors
+    ndarray, shape (n, 3)
+        Unit vectors.
     """
     points = _surface_points(mesh, radius)
     return _unit(_bump(points, centers, radius) @ points.normals)
@@ -259,21 +264,22 @@ def patch_normals(mesh: TetMesh, centers: np.ndarray, radius: float) -> np.ndarr
 def patch_loads(elasticity: Elasticity, centers: np.ndarray, radius: float) -> sp.csr_matrix:
     """Return the nodal forces of unit patch tractions in the three coordinate directions.
 
-    Column ``3 i + d`` integrates psi_{s_i} e_d against the element's shape functions; its
-    transpose averages: ``loads.T @ u`` is u_bar. The profile is normalized by its own quadrature,
-    so the total force of a column is one to rounding.
+    Column ``3 i + d`` integrates psi_{s_i} e_d against the element's shape functions; its transpose
+    averages: ``loads.T @ u`` is u_bar. The profile is normalized by its own quadrature, so the
+    total force of a column is one to rounding.
 
     Parameters
     ----------
     elasticity : Elasticity
     centers : ndarray, shape (n, 3)
-        Centers [m].
+        Patch centres [m].
     radius : float
         R [m].
 
     Returns
     -------
-    sparse, shape (3 n_nodes, 3 n) [N per N]
+    sparse, shape (3 n_nodes, 3 n)
+        Nodal forces [N per N].
 
     Raises
     ------
@@ -293,7 +299,7 @@ def patch_loads(elasticity: Elasticity, centers: np.ndarray, radius: float) -> s
 
 
 def _require_resolved(mesh: TetMesh, radius: float) -> None:
-    """Raise MeshError unless a patch is larger than the faces are fine, smaller than the organ."""
+    """Raise MeshError unless a patch is larger than the faces' edges and smaller than the organ."""
     if not 0.2 * mesh.mean_surface_edge <= radius < np.inf:
         raise MeshError(
             f"a patch of radius {radius:g} m cannot be resolved by surface edges of "
@@ -335,7 +341,7 @@ def _surface_points(mesh: TetMesh, radius: float) -> _SurfacePoints:
 
 
 def _bump(points: _SurfacePoints, centers: np.ndarray, radius: float) -> sp.csr_matrix:
-    """Quadrature weights times (1 - |x - s|^2 / R^2)^2, sparse, shape (n_centers, n_points)."""
+    """Return quadrature weights times (1 - |x - s|^2 / R^2)^2, sparse, (n_centers, n_points)."""
     near = cKDTree(points.points).query_ball_point(centers, radius)
     size = np.array([len(hit) for hit in near])
     center = np.repeat(np.arange(len(centers)), size)
@@ -346,7 +352,7 @@ def _bump(points: _SurfacePoints, centers: np.ndarray, radius: float) -> sp.csr_
 
 
 def _trace(elasticity: Elasticity, points: _SurfacePoints) -> sp.csr_matrix:
-    """Shape functions of the boundary's nodes at the quadrature points."""
+    """Return shape functions of the boundary's nodes at the quadrature points."""
     barycentric, n_faces = points.barycentric, len(elasticity.face_nodes)
     shape = barycentric if elasticity.element == "P1" else triangle_shape(barycentric)
     nodes = np.repeat(elasticity.face_nodes, len(barycentric), axis=0)
@@ -358,7 +364,7 @@ def _trace(elasticity: Elasticity, points: _SurfacePoints) -> sp.csr_matrix:
 
 
 def scaled_gram(elasticity: Elasticity, loads: sp.spmatrix) -> sp.csr_matrix:
-    """F^T D^-1 F of loads F and D = diag K, by which residuals are measured, (n_loads, n_loads)."""
+    """Return F^T D^-1 F of loads F, (n_loads, n_loads), which measures residuals; D = diag K."""
     return (loads.T @ sp.diags(1.0 / elasticity.diagonal) @ loads).tocsr()
 
 

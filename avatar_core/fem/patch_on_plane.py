@@ -1,21 +1,23 @@
 """The patch of a vademecum on an elastic half-space, in closed form.
 
-Its traction is 3 F / (pi R_p^2) (1 - r^2 / R_p^2)^2, of the Hankel transform F 48 J_3(x) / x^3 with
-x = k R_p. The surface moves by 2 / (E* k) times that of a load (Johnson, Contact Mechanics, 1985,
-Sec. 3), so that a patch moves another at the distance rho, in the mean under its own traction, by
+Its traction is 3 F / (pi R_p^2) (1 - r^2 / R_p^2)^2, with the Hankel transform F 48 J_3(x) / x^3, x
+= k R_p. In Hankel space the surface moves by 2 / (E* k) times the load (Johnson, Contact Mechanics,
+1985, Sec. 3). A patch therefore moves another one at the distance rho, averaged under the other's
+traction, by
 
     F / (E* R_p) P(rho / R_p),      P(y) = 1 / pi int_0^inf [48 J_3(x) / x^3]^2 J_0(x y) dx,
 
 P(0) = 0.7665, and P -> 1 / (pi y) far off.
 
-Between the load positions of an organ the response is interpolated, from both sides. That is exact
-but for what bends between them, which is local: that of a half-space. What sum_ij w_i w_j C_ij
-misses of C(s, s) is therefore
+Between the load positions of an organ the response is interpolated, from both sides. The
+interpolation error is local, and therefore that of a half-space. The interpolant sum_ij w_i w_j
+C_ij falls short of C(s, s) by
 
     1 / (E* R_p) sum_ij w_i w_j [P(0) - P(|x_i - x_j| / R_p)].
 
-For weights that spread little it is proportional to the Laplacian of P at 0, and between two points
-at the distance y R_p to that at y: it fades as Q(y) = lap P(y) / lap P(0).
+For weights that spread little, the error is proportional to the Laplacian of P at 0. Between two
+points at the distance y R_p it is proportional to the Laplacian at y: it fades as Q(y) = lap P(y) /
+lap P(0).
 """
 
 from __future__ import annotations
@@ -56,7 +58,7 @@ def quarter_turn(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def meeting_table() -> np.ndarray:
-    """Return the p, dP/dy, Q and dQ/dy over y in [0, FAR], shape (n + 1, 4)."""
+    """Return P, dP/dy, Q and dQ/dy over y in [0, FAR], shape (n + 1, 4)."""
     # Here, because the contact node needs none of it.
     from scipy.special import j0, jv, roots_legendre
 
@@ -71,7 +73,7 @@ def meeting_table() -> np.ndarray:
 
 @fast
 def meeting(table, y):  # type: ignore[no-untyped-def]
-    """P and dP/dy at a distance of two patches [R_p]."""
+    """Return P and dP/dy at a distance of two patches [R_p]."""
     if y >= FAR:
         far = 1.0 / (np.pi * y)
         wide = _WIDTHS / (y * y)
@@ -81,7 +83,7 @@ def meeting(table, y):  # type: ignore[no-untyped-def]
 
 @fast
 def shared_blur(table, y):  # type: ignore[no-untyped-def]
-    """Q and dQ/dy at a distance of two points [R_p]; far off it falls as lap 1 / y, y^-3."""
+    """Return Q and dQ/dy at a distance of two points [R_p]; far off Q falls as lap 1 / y, y^-3."""
     if y >= FAR:
         far = table[table.shape[0] - 1, 2] * (FAR / y) ** 3
         return far, -3.0 * far / y
@@ -90,7 +92,7 @@ def shared_blur(table, y):  # type: ignore[no-untyped-def]
 
 @fast
 def _in_table(table, column, y):  # type: ignore[no-untyped-def]
-    """A function and its slope, by cubic Hermite interpolation."""
+    """Return a function and its slope, by cubic Hermite interpolation."""
     h = FAR / _INTERVALS
     k = int(y / h)
     t = y / h - k
@@ -101,14 +103,14 @@ def _in_table(table, column, y):  # type: ignore[no-untyped-def]
 
 
 def missed_between(positions: np.ndarray, carrier: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return E* R_p times what interpolation misses of C(s, s), shape (n,).
+    """Return the interpolation error of C(s, s) times E* R_p, shape (n,).
 
     Parameters
     ----------
     positions : ndarray, shape (n_positions, 3)
-        Positions of the load positions [R_p].
+        Load positions [R_p].
     carrier, weight : ndarray, shape (n, k)
-        Load positions and weights of each point.
+        Load positions of each point, and their weights.
     """
     return np.asarray(_missed_between(meeting_table(), positions, carrier, weight))
 

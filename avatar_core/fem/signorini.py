@@ -1,19 +1,19 @@
 """Resolved contact of rigid frictionless tips with the elastic organ: Signorini's problem.
 
-A tip pushed in along -n to the depth d below a place x_0 takes the room above -d + f(r), f being
-its profile (:mod:`avatar_core.geometry.tip`), r the distance from its axis and z = (x - x_0).n.
-In small strain and along the fixed direction n, the surface keeps out of that room where
+A tip is pushed in along -n to the depth d below a place x_0. It takes the room above -d + f(r),
+with its profile f (:mod:`avatar_core.geometry.tip`), the distance r from its axis, and z = (x -
+x_0).n. In small strain and along the fixed direction n, the surface keeps out of that room where
 
-    -u.n >= d + z - f(r),   p >= 0,   p (-u.n - d - z + f(r)) = 0   for r < radius,
+    -u.n >= d + z - f(r),   p >= 0,   p (-u.n - d - z + f(r)) = 0   for r < radius.
 
-p being the traction along -n per area of the surface (Signorini 1933; Kikuchi & Oden, Contact
-Problems in Elasticity, 1988). p is linear on the boundary's triangles, cut off at the tip's rim,
-and the condition holds in the mean over each of its hats. With K^-1 condensed to C = B^T K^-1 B
-on the hats that a tip can reach, what is left is a small linear complementarity problem for each
-depth: C p - b >= 0, p >= 0, p.(C p - b) = 0.
+p is the traction along -n per area of the surface (Signorini 1933; Kikuchi & Oden, Contact Problems
+in Elasticity, 1988). p is linear on the boundary's triangles, cut off at the tip's rim, and the
+condition holds on average over each of its hats. K^-1 is condensed to C = B^T K^-1 B on the hats
+that a tip can reach. A small linear complementarity problem remains for each depth: C p - b >= 0, p
+>= 0, p.(C p - b) = 0.
 
-A frictionless ball takes no moment about its centre, but along an n of which its contact lies to
-the side these tractions have one. :func:`through_centre` gives the n along which they have none.
+A frictionless ball has no moment about its centre. These tractions have one if the contact lies to
+the side of n. :func:`through_centre` gives the n without a moment.
 
 The error falls with the elements; :func:`avatar_core.geometry.refinement.refine` makes them small.
 """
@@ -52,7 +52,7 @@ class Push:
     point : ndarray, shape (3,)
         x_0 on the surface, where the depth is zero [m].
     axis : ndarray, shape (3,)
-        Unit, pointing out of the organ.
+        Unit vector out of the organ.
     """
 
     tip: Tip
@@ -62,7 +62,7 @@ class Push:
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """What one tip feels, and where.
+    """Force and contact of one tip.
 
     Attributes
     ----------
@@ -73,12 +73,12 @@ class Touch:
     radius : float
         Radius of the disc with the area of the contact [m].
     lean : ndarray, shape (3,)
-        Across the axis, the tangent of the angle between the axis and the way from the centre of
-        pressure to that of the ball; zero for other tips.
+        Vector across the axis: the tangent of the angle between the axis and the line from the
+        centre of pressure to the ball's centre. Zero for other tips.
     vertices : ndarray of int, shape (n,)
         Vertices of the mesh under pressure.
     pressures : ndarray, shape (n,)
-        p at them [Pa].
+        p at these vertices [Pa].
     """
 
     depth: float
@@ -96,7 +96,7 @@ class Contact:
     Attributes
     ----------
     touches : tuple[Touch, ...]
-        Touches of each tip.
+        Contact of each tip.
     loads : ndarray, shape (3 n_nodes,)
         Nodal forces on the organ [N].
     violation : float
@@ -115,12 +115,15 @@ class Contact:
 
 @dataclass(frozen=True, eq=False)
 class _Zone:
-    """The hats that one tip can reach; those at its rim are cut off there.
+    """The hats that one tip can reach; hats at its rim are cut off there.
 
-    vertices : (m,); loads : sparse (3 n_nodes, m), nodal forces of unit pressures along -n [m2];
-    areas : (m,), integral of each hat [m2]; heights : (m,), that of (z - f) times it [m3];
-    aside : (m, 3), mean place across the axis [m]; below : (m,), how far below the ball's centre it
-    touches there, 0 for other tips [m]; outermost : (m,) bool, those beyond which the tip goes on
+    vertices : (m,), vertices of the hats
+    loads : sparse (3 n_nodes, m), nodal forces of unit pressures along -n [m2]
+    areas : (m,), integral of each hat [m2]
+    heights : (m,), integral of each hat times (z - f) [m3]
+    aside : (m, 3), mean place across the axis [m]
+    below : (m,), depth of the touching point below the ball's centre, 0 for other tips [m]
+    outermost : (m,) bool, hats beyond which the tip goes on
     """
 
     vertices: np.ndarray
@@ -133,7 +136,7 @@ class _Zone:
 
 
 class CondensedContact:
-    """An organ reduced to the surface that some tips can reach, for any depths up to the deepest.
+    """An organ condensed to the surface that some tips can reach, for depths up to a largest one.
 
     One factorization and one condensation serve all tips, alone or together.
 
@@ -142,13 +145,13 @@ class CondensedContact:
     elasticity : Elasticity
         Elasticity on a mesh fine around the tips.
     pushes : Sequence[Push]
-        One for each tip.
-    deepest : ndarray, shape (n_pushes,)
-        Or a number, the largest depth asked for later [m].
+        One push for each tip.
+    deepest : ndarray, shape (n_pushes,), or float
+        Largest depth asked for later [m].
     reach : float
-        Radius of the candidate surface over that of the contact on a half-space.
+        Radius of the candidate surface over the contact radius on a half-space.
     progress : Callable[[float], None] or None
-        Is told which part of the condensation is done.
+        Called with the finished fraction of the condensation.
 
     Raises
     ------
@@ -175,7 +178,7 @@ class CondensedContact:
     def first_depths(self) -> np.ndarray:
         """Depth at which each tip first touches, to an element, shape (n_pushes,) [m].
 
-        Far below zero in a hollow narrower than the tip, whose sides touch before the place does.
+        The depth is far below zero in a hollow narrower than the tip, whose sides touch first.
         """
         return np.array([(-zone.heights / zone.areas).min() for zone in self._zones])
 
@@ -223,10 +226,10 @@ class CondensedContact:
 
 
 def through_centre(push: Push, touch: Touch) -> Push:
-    """Return the push of the same ball in the same place, its axis turned by what ``touch`` leans.
+    """Return the push of the same ball in the same place, its axis turned by ``touch.lean``.
 
-    Its force then acts along the way from the centre of pressure to the ball's; a few turns find
-    the axis about which nothing leans. Other tips are left as they are.
+    Its force then acts along the line from the centre of pressure to the ball's centre. A few turns
+    find the axis with no lean. Other tips do not change.
     """
     axis = push.axis - touch.lean
     axis /= np.linalg.norm(axis)
@@ -235,7 +238,7 @@ def through_centre(push: Push, touch: Touch) -> Push:
 
 
 def half_space_radius(tip: Tip, depth: float) -> float:
-    """Return radius a of the contact with a half-space at a depth [m]; the tip's own at most."""
+    """Return the contact radius a on a half-space at a depth [m]; at most the tip's own radius."""
     if tip.shape == "flat":
         return tip.radius
 
@@ -251,13 +254,15 @@ def half_space_radius(tip: Tip, depth: float) -> float:
 def complementary(compliance: np.ndarray, needed: np.ndarray) -> np.ndarray:
     """Return p >= 0 with C p - b >= 0 and p.(C p - b) = 0, by a primal-dual active set.
 
-    Hintermueller, Ito & Kunisch, SIAM J. Optim. 13:865 (2002); where the set comes back to an
-    earlier one, it is found by non-negative least squares, |L^T p - L^-1 b| with C = L L^T.
+    Source: Hintermueller, Ito & Kunisch, SIAM J. Optim. 13:865 (2002). If the set comes back to an
+    earlier one, non-negative least squares find p: |L^T p - L^-1 b| with C = L L^T.
 
     Parameters
     ----------
-    compliance : ndarray, shape (n, n), C, symmetric positive definite
-    needed : ndarray, shape (n,), b
+    compliance : ndarray, shape (n, n)
+        C, symmetric positive definite.
+    needed : ndarray, shape (n,)
+        b.
 
     Raises
     ------
@@ -377,7 +382,7 @@ def _edge_at(mesh: TetMesh, point: np.ndarray) -> float:
 
 
 def _cylindrical(offset: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance from an axis, and position along it."""
+    """Return the distance from an axis, and the position along it."""
     z = offset @ axis
     return np.sqrt(np.maximum((offset**2).sum(axis=-1) - z**2, 0.0)), z
 
@@ -385,7 +390,7 @@ def _cylindrical(offset: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, np.n
 def _hat_loads(
     elasticity: Elasticity, faces: np.ndarray, area: np.ndarray, barycentric: np.ndarray
 ) -> sp.csc_matrix:
-    """int N_a psi_i da of nodes a and hats i over the quadrature's area, (n_nodes, n_vertices)."""
+    """Return int N_a psi_i da of nodes a and hats i, shape (n_nodes, n_vertices)."""
     nodes, corners = elasticity.face_nodes[faces], elasticity.mesh.boundary_faces[faces]
     shape = barycentric if elasticity.element == "P1" else triangle_shape(barycentric)
     blocks = np.einsum("fq,qa,qk->fak", area, shape, barycentric)
@@ -398,10 +403,10 @@ def _hat_loads(
 def _distinct(
     zones: Sequence[_Zone], pushes: Sequence[Push]
 ) -> tuple[sp.csc_matrix, list[np.ndarray]]:
-    """Return the different hats of all tips, and which of them are each tip's.
+    """Return the different hats of all tips, and each tip's numbers in them.
 
-    Tips at one place share all hats but those at their rims; a hat is known by its vertex, its
-    area and its axis.
+    Tips at one place have all hats in common but those at their rims. A hat is identified by its
+    vertex, its area and its axis.
     """
     names = [
         np.column_stack(

@@ -9,8 +9,8 @@ g = |x - c| - R, x = (r + u_r, u_z), c = (0, R - d). At small strain, Sneddon's 
 Eng. Sci. 3:47, 1965), the gap is along z at the undeformed radius, R - sqrt(R^2 - r^2) - d - u_z.
 The force is dPi / dd. Lengths are in radii of the sphere and stresses in Young's moduli.
 
-The penalty epsilon lets the sphere in by p / epsilon, 1e-4 R at most at the default. A cylinder of
-1000 R (:mod:`avatar_core.fem.axisymmetric`) stands for the half-space.
+The penalty epsilon lets the sphere penetrate by p / epsilon, 1e-4 R at most at the default. A
+cylinder of 1000 R (:mod:`avatar_core.fem.axisymmetric`) stands for the half-space.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Domain:
     extent : float
         Radius and height of the cylinder [R].
     penalty : float
-        Epsilon [E / R].
+        epsilon [E / R].
     """
 
     element: float = 0.1
@@ -60,7 +60,7 @@ class Domain:
 
 
 class Indentation(NamedTuple):
-    """What a depth takes.
+    """Equilibrium at one depth.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class Indentation(NamedTuple):
 
 @dataclass(frozen=True)
 class _Hooke:
-    """psi = lambda / 2 (tr eps)^2 + mu eps:eps of the small strain eps = sym(F) - I."""
+    """Energy psi = lambda / 2 (tr eps)^2 + mu eps:eps of the small strain eps = sym(F) - I."""
 
     linear: Material
 
@@ -116,11 +116,10 @@ class SphereIndentation:
     Parameters
     ----------
     poisson_ratio : float
-        Nu.
     large_strain : bool
-        Neo-Hookean, and contact on the deformed surface; otherwise Sneddon's problem.
+        Whether the material is neo-Hookean and contact is on the deformed surface; otherwise
+        Sneddon's problem.
     domain : Domain or None
-        Domain.
     """
 
     def __init__(
@@ -166,7 +165,7 @@ class SphereIndentation:
         return state
 
     def _equilibrium(self, u: np.ndarray, depth: float) -> np.ndarray:
-        """Return Newton's method as a descent of the energy."""
+        """Return the equilibrium at a depth, by Newton's method as a descent of the energy."""
         free = self.body.free
         for _ in range(_MAX_ITERATIONS):
             residual, force = self._residual(u, depth)
@@ -189,7 +188,7 @@ class SphereIndentation:
         )
 
     def _gap(self, u: np.ndarray, depth: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """g, its gradient by u (..., 2) and, at large strain, 1 / |x - c|, at the surface."""
+        """Return g at the surface, its gradient by u (..., 2) and, at large strain, 1 / |x - c|."""
         moved = np.einsum("fqa,fad->fqd", self.body.top_shape, u[self.body.top])
         r = self.body.top_radius
         if not self.large_strain:
@@ -201,7 +200,7 @@ class SphereIndentation:
         return distance - 1.0, offset / distance[..., None], 1.0 / distance
 
     def _energy(self, u: np.ndarray, depth: float) -> float:
-        """Return the pi, infinite where a quadrature point is inverted."""
+        """Return Pi, infinite where a quadrature point is inverted."""
         if self.large_strain and self.body.min_det(u) <= 0.0:
             return np.inf
         into = np.maximum(-self._gap(u, depth)[0], 0.0)
@@ -219,7 +218,7 @@ class SphereIndentation:
         return self.body.forces(u) + self.body.gathered(self.body.top, outer), force
 
     def _contact_tangent(self, u: np.ndarray, depth: float) -> np.ndarray:
-        """Second derivative of the penalty's energy at each edge, shape (n_edges, 18, 18)."""
+        """Return the penalty energy's second derivative at each edge, shape (n_edges, 18, 18)."""
         gap, normal, curvature = self._gap(u, depth)
         touching = self.domain.penalty * self.body.top_area * (gap < 0.0)
         along = np.einsum("fqi,fqj->fqij", normal, normal)
@@ -240,7 +239,7 @@ class SphereIndentation:
 
 
 def _ticks(domain: Domain) -> np.ndarray:
-    """Return edges of the elements along r and -z: of one size around the contact, then growing."""
+    """Return edges of the elements along r and -z: equal around the contact, then growing."""
     ticks = [0.0]
     while ticks[-1] < domain.extent:
         ticks.append(ticks[-1] + max(domain.element, _GROWTH * (ticks[-1] - _FINE)))

@@ -1,13 +1,14 @@
 """Stiffness matrices of isotropic elasticity from products of scalar gradients.
 
-Everything follows from G_iajb = int chi d_i phi_a d_j phi_b dx, phi_a the shape functions of one
-component, chi the volume fraction of the material in each tetrahedron:
+Everything follows from G_iajb = int chi d_i phi_a d_j phi_b dx. phi_a are the shape functions of
+one component, and chi is the volume fraction of the material in each tetrahedron:
 
     int chi div(u) div(v)          ->  G_iajb,
     int chi 2 eps(u):eps(v)        ->  delta_ij sum_k G_kakb + G_jaib,
 
-with i, a of the test function v and j, b of the trial function u. This takes a fifth of the time
-of a vector-valued form, whose 30 x 30 local entries are mostly products of the same few gradients.
+with i, a of the test function v and j, b of the trial function u. This takes a fifth of the time of
+a vector-valued form. The form's 30 x 30 local entries are mostly products of the same few
+gradients.
 """
 
 from __future__ import annotations
@@ -26,13 +27,17 @@ def unit_stiffness(
 
     Parameters
     ----------
-    basis : scikit-fem's scalar basis, quadrature exact for products of gradients
-    nodes : ndarray of int, shape (n_tets, n_shape), node of each shape function
-    volume_fraction : ndarray, shape (n_tets,), chi; None for 1
+    basis : CellBasis
+        scikit-fem's scalar basis, whose quadrature is exact for products of gradients.
+    nodes : ndarray of int, shape (n_tets, n_shape)
+        Node of each shape function.
+    volume_fraction : ndarray, shape (n_tets,), or None
+        chi; None for 1.
 
     Returns
     -------
-    shear, volume : sparse, shape (3 n_nodes, 3 n_nodes) [m], numbered 3 node + component
+    shear, volume : sparse, shape (3 n_nodes, 3 n_nodes)
+        Matrices [m], numbered 3 node + component.
     """
     weight = basis.dx if volume_fraction is None else basis.dx * volume_fraction[:, None]
     gradient = np.array([shape[0].grad for shape in basis.basis])  # (n_shape, 3, n_tets, n_points)
@@ -51,7 +56,7 @@ def unit_stiffness(
 
 
 class _Pattern:
-    """Where the 3 x 3 blocks of each tetrahedron go in the matrix of all nodes."""
+    """Places of the 3 x 3 blocks of each tetrahedron in the matrix of all nodes."""
 
     def __init__(self, nodes: np.ndarray) -> None:
         n_tets, n_shape = nodes.shape

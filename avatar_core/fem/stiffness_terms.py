@@ -1,8 +1,8 @@
-"""The matrices of which the stiffness is a sum, with factors that are the material's.
+"""Terms of the stiffness, a sum of constant matrices with factors of the material.
 
 K = sum_q theta_q K_q,    theta = mu, lambda; c mu, c lambda of an inclusion; k of each spring
 
-Springs are those of each support, then those of each strip of a cut.
+The springs of each support come first, then those of each strip of a cut.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ def scalar_mass(u, v, w):  # type: ignore[no-untyped-def]
 
 
 class StiffnessTerms:
-    """The constant matrices that a stiffness is made of, shared by all values of the material.
+    """The constant matrices of a stiffness, common to all values of the material.
 
     Parameters
     ----------
     mesh : TetMesh
     quadratic : bool
-        Whether displacements are (P2, Taylor-Hood), or linear (P1).
+        Whether displacements are quadratic (P2, Taylor-Hood) or linear (P1).
     volume_fraction : ndarray, shape (n_tets,)
         Volume fraction of an inclusion in each tetrahedron, or None.
     supported : Sequence[ndarray]
@@ -77,7 +77,7 @@ class StiffnessTerms:
     def unit_stiffness(self) -> tuple[sp.csr_matrix, ...]:
         """K_q of mu, lambda and those of an inclusion, (3 n_nodes, 3 n_nodes) [m].
 
-        Of P1 and P2; Taylor-Hood has the first as well.
+        P1 and P2 use them; Taylor-Hood uses the first as well.
         """
         node = np.argsort(self.nodes_first(self._basis))[self._basis.element_dofs.T]
         if self._volume_fraction is None:
@@ -87,12 +87,12 @@ class StiffnessTerms:
 
     @property
     def mesh(self) -> MeshTet:
-        """scikit-fem's."""
+        """scikit-fem's mesh."""
         return self._mesh
 
     @cached_property
     def spring_mass(self) -> tuple[sp.csr_matrix, ...]:
-        """Return int u.v da over each support, int [u].[v] da over each strip of a cut.
+        """Matrices int u.v da over each support, int [u].[v] da over each strip of a cut.
 
         Shapes (3 n_nodes, 3 n_nodes) [m^2].
         """
@@ -132,7 +132,7 @@ class StiffnessTerms:
 
     @cached_property
     def mass(self) -> sp.csr_matrix:
-        """Return int N_a N_b dx, shape (n_nodes, n_nodes) [m^3]."""
+        """Matrix int N_a N_b dx, shape (n_nodes, n_nodes) [m^3]."""
         matrix = scalar_mass.assemble(Basis(self._mesh, self._shape, intorder=4)).tocsr()
         order = self.nodes_first(self._basis)
         return matrix[order][:, order]

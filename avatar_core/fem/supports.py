@@ -4,14 +4,14 @@ On a support the traction is t = -k u, with a stiffness per area k [N/m^3] (a Ro
 weak form gains k int_support u.v da, one term that is affine in k; k -> infinity is the clamp.
 Springs do not pull before the organ moves, and resist in all directions alike.
 
-Nothing but supports and clamp keeps an organ from moving as a rigid body. Of a rigid motion r, the
-Rayleigh quotient
+Only supports and clamp keep an organ from moving as a rigid body. The Rayleigh quotient of a rigid
+motion r,
 
     q(r) = sum_i k_i int_i |r|^2 da / int_boundary |r|^2 da    [N/m^3]
 
-is the mean stiffness per area of the whole boundary that resists it. Its least value over the six
-rigid motions, times the length of the organ over Young's modulus, says how far the organ moves as
-a whole before it deforms.
+is the mean stiffness per area of the whole boundary that resists the motion. Take its least value
+over the six rigid motions, times the length of the organ over Young's modulus. This number says how
+far the organ moves as a whole before it deforms.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ class Support:
     Attributes
     ----------
     name : str
-        "bare_area", for example; letters, digits and _.
+        Letters, digits and _, e.g. "bare_area".
     faces : ndarray of bool, shape (n_faces,)
-        Over ``mesh.boundary_faces``.
+        Mask over ``mesh.boundary_faces``.
     stiffness : float
         k, per area [N/m^3].
 
     Raises
     ------
     MaterialError
-        For no face, or a stiffness that is not from ``LEAST_STIFFNESS`` to ``MOST_STIFFNESS``.
+        If no face is given, or the stiffness is not from ``LEAST_STIFFNESS`` to ``MOST_STIFFNESS``.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Support:
 
 
 def require_stiffness(name: str, stiffness: float) -> None:
-    """Raise MaterialError for a stiffness per area that no support has."""
+    """Raise MaterialError unless a stiffness per area is one that a support can have."""
     if not LEAST_STIFFNESS <= stiffness <= MOST_STIFFNESS:
         raise MaterialError(
             f"support {name} has a stiffness of {stiffness:g} N/m^3; give {LEAST_STIFFNESS:g} to "
@@ -78,7 +78,7 @@ def require_stiffness(name: str, stiffness: float) -> None:
 def with_stiffness(
     supports: Sequence[Support], stiffness: Mapping[str, float]
 ) -> tuple[Support, ...]:
-    """Supports at other stiffnesses per area, by name [N/m^3]; those not given keep theirs."""
+    """Return supports with other stiffnesses per area, by name [N/m^3]; others keep theirs."""
     return tuple(replace(s, stiffness=stiffness.get(s.name, s.stiffness)) for s in supports)
 
 
@@ -92,9 +92,12 @@ def boundary_mass(mesh: MeshTet, shape: Element, faces: FloatArray) -> sp.csr_ma
 
     Parameters
     ----------
-    mesh : scikit-fem's
-    shape : the element of one component, of degree 1 or 2: quadrature of degree 4 is exact
-    faces : ndarray of int, shape (n, 3), vertices of boundary faces
+    mesh : MeshTet
+        scikit-fem's mesh.
+    shape : Element
+        Element of one component, of degree 1 or 2: quadrature of degree 4 is exact.
+    faces : ndarray of int, shape (n, 3)
+        Vertices of boundary faces.
     """
     number = {tuple(facet): k for k, facet in enumerate(np.sort(mesh.facets, axis=0).T.tolist())}
     facets = np.array([number[tuple(face)] for face in np.sort(faces, axis=1).tolist()])
@@ -108,9 +111,9 @@ class RigidMotion:
     Attributes
     ----------
     resistance : float
-        q of it [N/m^3].
+        Its Rayleigh quotient q [N/m^3].
     text : str
-        What it is, in words.
+        Description of the motion.
     """
 
     resistance: float

@@ -1,4 +1,4 @@
-"""Shape functions and quadrature of triangles, faces of the elements."""
+"""Shape functions and quadrature of triangles, the faces of the elements."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from skfem.refdom import RefTri
 
 
 def triangle_shape(barycentric: np.ndarray) -> np.ndarray:
-    """Shape functions of the six-node triangle, the trace of a P2 element.
+    """Return the shape functions of the six-node triangle, the trace of a P2 element.
 
     Parameters
     ----------
-    barycentric : ndarray, shape (..., 3), coordinates (l0, l1, l2) that sum to one
+    barycentric : ndarray, shape (..., 3)
+        Coordinates (l0, l1, l2) that sum to one.
 
     Returns
     -------
-    ndarray, shape (..., 6): l(2l - 1) at the corners, 4 l l' at edges 01, 12, 20
+    ndarray, shape (..., 6)
+        l(2l - 1) at the corners, 4 l l' at edges 01, 12, 20.
     """
     corner = barycentric * (2.0 * barycentric - 1.0)
     return np.concatenate([corner, 4.0 * barycentric * np.roll(barycentric, -1, axis=-1)], axis=-1)

@@ -53,7 +53,7 @@ def is_label_map(path: Path) -> bool:
 
 
 def read_label_map(path: Path) -> Volume:
-    """Return all layers of a file as whole numbers; NaN and infinity become 0, which is outside.
+    """Return all layers of a file as whole numbers; NaN becomes 0, which is outside.
 
     Raises
     ------
