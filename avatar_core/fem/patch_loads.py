@@ -138,7 +138,7 @@ class LoadSurface:
         return np.concatenate([self.corners, n_corners + number.reshape(-1, 3)], axis=1)
 
     def weights(self, faces: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return load positions and interpolation weights at points of some faces, (n, 3 or 6) each.
+        """Return load positions and interpolation weights at points of faces, (n, 3 or 6) each.
 
         Interpolation is quadratic where the edges have midpoints, else linear. A position has
         weight one at itself and zero at the others.

@@ -1,12 +1,12 @@
 """Large deformation as a power series of the load: the asymptotic-numerical method.
 
-A dead load f L moves the organ along u(f) = sum_k f^k U_k. Inserted into the weak form,
-int P(F) : grad v dx = f L . v, every order is a linear problem with the stiffness at rest,
+A dead load f L moves the organ along u(f) = sum_k f^k U_k. Inserted into the weak form, int P(F) :
+grad v dx = f L . v, every order is a linear problem with the stiffness at rest,
 
-    K U_k = delta_k1 L - N_k(U_1, ..., U_k-1),
+    K U_k = delta_k1 L - N_k(U_1, ..., U_k-1).
 
-whose right-hand side follows from power series of the material's own quantities (Damil & Potier-
-Ferry, Int. J. Eng. Sci. 28:943, 1990; Cochelin, Computers & Structures 53:1181, 1994). With
+The right-hand side follows from power series of the material's own quantities (Damil &
+Potier-Ferry, Int. J. Eng. Sci. 28:943, 1990; Cochelin, Computers & Structures 53:1181, 1994). With
 F = I + sum_k f^k F_k these are, for the neo-Hookean material, G = F^-1 and l = ln det F from
 
     F G = I,     l' = tr(G F'),     P = mu (F - G^T) + lambda l G^T,
@@ -31,13 +31,14 @@ def path_series(problem: Hyperelasticity, loads: FloatArray, order: int) -> Floa
     ----------
     problem : Hyperelasticity
     loads : ndarray, shape (3 n_nodes, n)
-        Dead loads of unit size, each a path of its own.
+        Dead loads of unit size, one path each.
     order : int
         Highest power kept.
 
     Returns
     -------
-    ndarray, shape (order, 3 n_nodes, n) [m/N, m/N^2, ...]
+    ndarray, shape (order, 3 n_nodes, n)
+        Coefficients [m/N, m/N^2, ...].
     """
     out = np.zeros((order, *loads.shape))
     out[0] = problem.linear.solve(loads)
@@ -99,7 +100,7 @@ def _add_forces(gradients, volume, nodes, P, out):  # type: ignore[no-untyped-de
 def _neo_hookean(  # type: ignore[no-untyped-def]
     gradients, volumes, nodes, displacement, k, lam, mu, series_F, series_G, series_l, out
 ):
-    """Complete the order k - 1 of F, G, l and form what they give of order k without F_k."""
+    """Complete the order k - 1 of F, G, l and compute their parts of order k without F_k."""
     P, H = np.empty((3, 3)), np.empty((3, 3))
     for e in range(nodes.shape[0]):
         for q in range(volumes.shape[1]):
@@ -134,7 +135,7 @@ def _neo_hookean(  # type: ignore[no-untyped-def]
 def _st_venant(  # type: ignore[no-untyped-def]
     gradients, volumes, nodes, displacement, k, lam, mu, series_F, series_S, unused, out
 ):
-    """Complete the order k - 1 of F and S and form what they give of order k without F_k."""
+    """Complete the order k - 1 of F and S and compute their parts of order k without F_k."""
     P, E = np.empty((3, 3)), np.empty((3, 3))
     for e in range(nodes.shape[0]):
         for q in range(volumes.shape[1]):

@@ -2,12 +2,14 @@
 
     u(x, s_j) = sum_k Z_rbk(x) sum_m C_rbkm W_m(s_j),    x in block b, s_j in region r.
 
-The load surface is divided in regions, whose loads share the amplitudes a_m = sum_j f_j W_m(s_j)
-(:mod:`avatar_core.reduction.regional`), the points of the mesh in compact blocks
-(:mod:`avatar_core.reduction.block_modes`): a step reads the few modes Z_rb of the touched regions
-in each block, and sums them in the first-level cache. The first amplitudes of each region are those
-of the global modes, so that what moves the whole organ beside its loads (mass, weight, history) can
-be told from them; a part of its own shows it.
+The load surface is divided in regions, whose loads have common amplitudes a_m = sum_j f_j W_m(s_j)
+(:mod:`avatar_core.reduction.regional`). The points of the mesh are divided in compact blocks
+(:mod:`avatar_core.reduction.block_modes`). A step reads the few modes Z_rb of the touched regions
+in each block, and sums them in the first-level cache.
+
+The first amplitudes of each region are those of the global modes. Motions of the whole organ beside
+its loads (mass, weight, history) can therefore be separated from them; a part of its own displays
+them.
 """
 
 from __future__ import annotations
@@ -62,11 +64,11 @@ class Blocks:
         return out
 
     def that_hold(self, vertices: IntArray) -> int:
-        """Return the number of the first blocks that hold all of some vertices."""
+        """Return the number of leading blocks that hold all of some vertices."""
         return int(self.place[vertices].max(initial=-1)) // POINTS + 1
 
     def of(self, field: FloatArray) -> FloatArray:
-        """Columns (3 n_vertices, n) as (n_blocks, BLOCK, n), zero in places that are not filled."""
+        """Return columns (3 n_vertices, n) as (n_blocks, BLOCK, n), zero in unused places."""
         rows = field.reshape(len(field) // 3, 3, field.shape[1])
         found = np.zeros((len(self.vertex), 3, field.shape[1]), field.dtype)
         found[self.place] = rows
@@ -79,7 +81,7 @@ class Blocks:
 
 
 def blocks_of(points: FloatArray, shown: IntArray) -> Blocks:
-    """Compact blocks of the points (n, 3) of a mesh; those that are shown fill the first ones."""
+    """Return compact blocks of a mesh's points (n, 3); shown points fill the first blocks."""
     hidden = np.setdiff1d(np.arange(len(points)), shown)
     parts = [part[compact_order(points[part], POINTS)] for part in (np.unique(shown), hidden)]
     filled = [np.pad(part, (0, -len(part) % POINTS), constant_values=_NONE) for part in parts]
@@ -90,7 +92,7 @@ def blocks_of(points: FloatArray, shown: IntArray) -> Blocks:
 class BlockField:
     """A field over load positions and the blocks of a mesh.
 
-    Part 0 shows global modes that move beside the loads; then comes a part for each region.
+    Part 0 displays global modes that move beside the loads; one part for each region follows.
 
     Attributes
     ----------
@@ -99,7 +101,7 @@ class BlockField:
     load : ndarray, shape (n_positions, n_loads, most)
         W; zero beyond the region's amplitudes.
     count : ndarray of int32, shape (n_parts,)
-        Amplitudes of each part; part 0 has the global ones.
+        Number of amplitudes of each part; part 0 has the global ones.
     space : ndarray of int16, shape (n, BLOCK)
         Z, each with a peak of 32767.
     core : ndarray, shape (n, most)
@@ -107,7 +109,7 @@ class BlockField:
     level : ndarray of int32, shape (n,)
         Level of each mode in its part; see :class:`BlockModes`.
     start : ndarray of int64, shape (n_parts, n_blocks + 1)
-        Modes of each part in each block.
+        First mode of each part in each block.
     """
 
     region: IntArray
@@ -125,12 +127,12 @@ class BlockField:
 
     @property
     def n_shared(self) -> int:
-        """Global modes, the first amplitudes of every region."""
+        """Number of global modes, the first amplitudes of every region."""
         return int(self.count[0])
 
     @property
     def rank(self) -> int:
-        """Amplitudes of the region that has most."""
+        """Largest number of amplitudes of a region."""
         return self.load.shape[2]
 
     @property
@@ -151,7 +153,7 @@ class BlockField:
         return out
 
     def amplitude(self, region: int, positions: IntArray, forces: FloatArray) -> FloatArray:
-        """Amplitudes of a region by forces (n, n_loads, m) at some positions, shape (count, m)."""
+        """Return a region's amplitudes by forces (n, n_loads, m) at some positions, (count, m)."""
         load = self.load[positions, :, : self.count[1 + region]]
         return np.asarray(np.tensordot(load, forces, ((0, 1), (0, 1))))
 
@@ -170,7 +172,7 @@ class BlockField:
         return self.under(positions, np.asarray(weights, np.float32)[:, None, None] * one)
 
     def with_most(self, most: int) -> BlockField:
-        """Return the same with the first amplitudes of each region alone."""
+        """Return the same field with the first amplitudes of each region alone."""
         return replace(
             self,
             load=self.load[:, :, :most],
@@ -179,7 +181,7 @@ class BlockField:
         )
 
     def softened(self, factor: float) -> BlockField:
-        """Return the field times a number, global modes and their amplitudes by its root each."""
+        """Return the field times a number; global modes and their amplitudes each get its root."""
         root, n = np.float32(np.sqrt(factor)), self.n_shared
         load, core = np.float32(factor) * self.load, self.core.copy()
         load[:, :, :n] = root * self.load[:, :, :n]
@@ -197,24 +199,26 @@ def separate_field(
     tolerance: float = TOLERANCE,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> BlockField:
-    """Return the field of global modes and those of regions, in blocks.
+    """Return the field of global modes and regions' modes, in blocks.
 
     Parameters
     ----------
     blocks : Blocks
     volumes : ndarray, shape (n_vertices,)
-        By which errors are weighted.
+        Weights of errors.
     region : ndarray of int32, shape (n_positions,)
         Region of each load position.
     regions : Sequence[RegionModes]
-        RegionModes of each region.
+        Modes of each region.
     shared : tuple[ndarray, ndarray] or None
         Global modes (3 n_vertices, k) and their amounts in each load (n_positions, n_loads, k);
         None if there are none.
     motion : ndarray, shape (n, k)
         Amplitudes that the global modes may have beside the loads.
     tolerance : float
-        Tolerance of a region's loads, as of :func:`separate_blocks`.
+        Tolerance of a region's loads; see :func:`separate_blocks`.
+    progress : Callable[[float], None]
+        Called with the finished fraction.
     """
     n_loads = regions[0].load.shape[1]
     if shared is None:
@@ -253,7 +257,7 @@ def _joined(
 ) -> tuple[IntArray, FloatArray, IntArray, IntArray]:
     """Return space in 16 bits, core, level and start of all parts.
 
-    The time of a step is that of reading its modes; these take half as long as in single precision.
+    A step's time is the time to read its modes; 16 bits take half as long as single precision.
     """
     before = np.cumsum([0] + [len(part.space) for part in parts])
     core = np.zeros((before[-1], most), np.float32)

@@ -1,14 +1,15 @@
 """Modes that live in one block of points each: a separated field, separated once more in space.
 
-Far from its loads a field u(x) = sum_m B_m(x) a_m is smooth: there a few modes serve, where near
-them it takes dozens. With the points in compact blocks b,
+Far from its loads a field u(x) = sum_m B_m(x) a_m is smooth: a few modes suffice there, against
+dozens near the loads. With the points in compact blocks b,
 
-    u(x) ~ sum_k Z_bk(x) sum_m C_bkm a_m,    x in b,
+    u(x) ~ sum_k Z_bk(x) sum_m C_bkm a_m,    x in b.
 
-Z_b are the principal components of what the loads move in the block, as many as it needs: the
-low-rank blocks of a hierarchical matrix (Hackbusch, Computing 62, 1999) with a basis shared by all
-loads of a region. One threshold holds for all blocks of a field, so that with as many modes no
-other choice leaves less; and fewer modes of a field are those of a higher threshold.
+Z_b are the principal components of the displacement of a block under the loads, as many as it
+needs. These are the low-rank blocks of a hierarchical matrix (Hackbusch, Computing 62, 1999) with a
+basis common to all loads of a region. One threshold holds for all blocks of a field. With as many
+modes, no other choice has a smaller error; and fewer modes of a field are those of a higher
+threshold.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ class BlockModes(NamedTuple):
     space : ndarray of float32, shape (n, values of a block)
         Z, each with a peak of 1.
     core : ndarray of float32, shape (n, m)
-        C, of the amplitudes of m modes of the whole field.
+        C, from the amplitudes of m modes of the whole field.
     level : ndarray of int32, shape (n,)
-        Level from 1 on: modes for each block, in the mean over the blocks, with which this one is
-        the first to be among them; ascending in each block.
+        Rank at which this mode is first kept, averaged over blocks; from 1 on, ascending in each
+        block.
     start : ndarray of int64, shape (n_blocks + 1,)
-        Modes of each block, the strongest first.
+        First mode of each block, the strongest first.
     """
 
     space: FloatArray
@@ -43,7 +44,7 @@ class BlockModes(NamedTuple):
 
     @staticmethod
     def none(n_blocks: int, size: int, m: int) -> BlockModes:
-        """Of a field that moves nothing."""
+        """Return the modes of a zero field."""
         single, start = np.float32, np.zeros(n_blocks + 1, np.int64)
         return BlockModes(
             np.zeros((0, size), single), np.zeros((0, m), single), np.zeros(0, np.int32), start
@@ -53,8 +54,8 @@ class BlockModes(NamedTuple):
 def compact_order(points: FloatArray, size: int) -> IntArray:
     """Return an order of points in which each ``size`` successive ones lie together.
 
-    By recursive coordinate bisection (Berger & Bokhari, IEEE Trans. Computers 36, 1987): halved
-    across the longest side, at a multiple of ``size``.
+    Recursive coordinate bisection (Berger & Bokhari, IEEE Trans. Computers 36, 1987) halves the
+    points across the longest side, at a multiple of ``size``.
 
     points : ndarray, shape (n, 3)
     """
@@ -71,7 +72,10 @@ def compact_order(points: FloatArray, size: int) -> IntArray:
 
 
 def load_sizes(fields: FloatArray, mass: FloatArray, loads: FloatArray) -> FloatArray:
-    """L2 norms of the displacement by each load, shape (n_loads,); see :func:`separate_blocks`."""
+    """Return the L2 norm of the displacement by each load, shape (n_loads,).
+
+    For the parameters see :func:`separate_blocks`.
+    """
     gram = np.tensordot(fields, mass[:, :, None] * fields, ((0, 1), (0, 1)))
     return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", loads, gram, loads)))
 
@@ -83,11 +87,16 @@ def separate_blocks(
 
     Parameters
     ----------
-    fields : ndarray, shape (n_blocks, values of a block, m), B
-    mass : ndarray, shape (n_blocks, values of a block), lumped, by which errors are weighted
-    loads : ndarray, shape (n_loads, m), amplitudes a by which the field is judged
-    sizes : ndarray, shape (n_loads,), L2 norms by which errors of these loads are relative
-    tolerance : root mean square over the loads of the relative L2 error that is left
+    fields : ndarray, shape (n_blocks, values of a block, m)
+        B.
+    mass : ndarray, shape (n_blocks, values of a block)
+        Lumped mass, which weights errors.
+    loads : ndarray, shape (n_loads, m)
+        Amplitudes a for which the error is measured.
+    sizes : ndarray, shape (n_loads,)
+        L2 norms to which the errors of these loads are relative.
+    tolerance : float
+        Root mean square over the loads of the remaining relative L2 error.
     """
     if fields.size == 0:
         return BlockModes.none(*fields.shape)

@@ -1,4 +1,4 @@
-"""Elastic response of one anatomy, or of a combination of some, in few modes."""
+"""Elastic response of one anatomy, or of a combination of anatomies, in few modes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class CompactResponse:
     load : ndarray, shape (3 n_positions, rank)
         Y.
     residual_compliance : ndarray, shape (n_positions, 3, 3)
-        Residual compliance [m/N], C - Y Y^T of each patch.
+        C - Y Y^T of each patch [m/N].
     """
 
     space: FloatArray

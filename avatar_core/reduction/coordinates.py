@@ -1,9 +1,9 @@
-"""The coordinates of a vademecum u(x, s, p), of material and supports: ranges at build time.
+"""Coordinates of a vademecum u(x, s, p), for material and supports: ranges at build time.
 
 All coordinates enter the stiffness through affine factors of constant matrices
-(:attr:`avatar_core.fem.elasticity.Elasticity.factors`), so that everything that depends on them is
-a small problem. Responses are computed at a few nodes in each range; between them, weights are
-those of (multi)linear interpolation in
+(:attr:`avatar_core.fem.elasticity.Elasticity.factors`). Everything that depends on them is
+therefore a small problem. Responses are computed at a few nodes in each range; between them,
+weights are those of (multi)linear interpolation in
 
     poisson   -log(1 - 2 nu), in which the response varies evenly towards incompressibility
     contrast   log c
@@ -11,8 +11,8 @@ those of (multi)linear interpolation in
     resection   r, the part of a cut that is opened (:mod:`avatar_core.fem.resection`)
 
 Canonical PGD, one product of functions of place, load and each coordinate, is not used. It needs
-several times as many modes and stagnates at 13 % of the displacement towards incompressibility,
-where the energy norm sees nothing but the change of volume.
+several times as many modes. It also stagnates at 13 % of the displacement towards
+incompressibility, where the energy norm contains little but the change of volume.
 """
 
 from __future__ import annotations
@@ -54,9 +54,10 @@ class Coordinate:
         outside), "support.NAME" (stiffness per area of a support [N/m^3]) or "resection" (opened
         part of a cut).
     low, high : float
-        Its range.
+        Limits of its range.
     n_nodes : int
-        n nodes at which the organ is solved, both ends included; 0: as many as the range needs.
+        Number of nodes at which the organ is solved, both ends included; 0 for as many as the range
+        needs.
 
     Raises
     ------
@@ -99,7 +100,7 @@ class Coordinate:
 
     @classmethod
     def parse(cls, text: str) -> Coordinate:
-        """Return ``NAME=LOW:HIGH`` or ``NAME=LOW:HIGH:NODES``, as on the command line."""
+        """Parse a coordinate from the command line, e.g. `poisson=0.40:0.49` or `0.40:0.49:5`."""
         name, _, span = text.partition("=")
         try:
             low, high, *nodes = span.split(":")
@@ -125,12 +126,14 @@ class Coordinate:
         return float(np.clip(value, self.low, self.high))  # not even rounding leaves the range
 
     def fraction(self, value: float) -> float:
-        """Where a value lies in the range, 0 to 1, in the coordinate's own scale."""
+        """Return the place of a value in the range, 0 to 1, in the coordinate's own scale."""
         low, high = self._scaled(self.low), self._scaled(self.high)
         return (self._scaled(value) - low) / (high - low)
 
     def weights(self, value: float) -> np.ndarray:
-        """Return the weights of the nodes at a value: at least 0, summing to 1, at most two not 0.
+        """Return the weights of the nodes at a value.
+
+        The weights are at least 0 and sum to 1; at most two differ from 0.
 
         Raises
         ------
@@ -183,7 +186,7 @@ def require_known(coordinates: Sequence[Coordinate], values: Mapping[str, float]
 
 
 def option_of(name: str) -> str:
-    """Return the option of the command line that makes a coordinate."""
+    """Return the command-line option that makes a coordinate."""
     if name == RESECTION:
         return "--resection FILE"
     is_support = name.startswith(SUPPORT)
@@ -192,7 +195,7 @@ def option_of(name: str) -> str:
 
 
 def fixed_support(name: str, young: float) -> CoordinateError:
-    """That a support is no coordinate, and with it Young's modulus [Pa] cannot be chosen."""
+    """Return the error that a support is no coordinate, so that Young's modulus [Pa] is fixed."""
     return CoordinateError(
         f"support {name} is fixed, and with it Young's modulus at {young:g} Pa; build with "
         f"--support {name}=LOW:HIGH to choose both"
@@ -200,7 +203,7 @@ def fixed_support(name: str, young: float) -> CoordinateError:
 
 
 def stiffness_of(values: Mapping[str, float]) -> dict[str, float]:
-    """Of supports, by their own names, among values by name of a coordinate [N/m^3]."""
+    """Return the stiffness of supports [N/m^3], by their own names, among values by coordinate."""
     return {n.removeprefix(SUPPORT): k for n, k in values.items() if n.startswith(SUPPORT)}
 
 

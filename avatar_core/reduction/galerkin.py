@@ -5,16 +5,16 @@ patient's own mesh each gives one solution, and these span the first space,
 
     K X_k = sum_s w_k(s) f(s),      Y(s) = X^T f(s),      u(x, s) ~ X(x) Y(s)^T,
 
-the Galerkin projection for K-orthonormal X. (Displacement modes carried over would have to be
-smoothed by K first: 20 sweeps of it cost more than ten direct solutions.) The space grows by the
-solutions for the loads whose residual r = f - K X Y^T is largest in the norm of the diagonal D,
+the Galerkin projection for K-orthonormal X. (Displacement modes of the neighbours would have to be
+smoothed by K first: 20 sweeps of smoothing cost more than ten direct solutions.) The space grows by
+the solutions for the loads whose residual r = f - K X Y^T is largest in the norm of the diagonal D,
 
-    eta(s)^2 = r(s) . D^-1 r(s),
+    eta(s)^2 = r(s) . D^-1 r(s).
 
-against the compliance under the patch or against the same norm of the load, whichever says more:
-where a thin lobe gives way, the compliance is large and hides a large error. A few *probes*, loads
-solved exactly that never enter the space, calibrate eta as an estimate of the error of every load,
-and give the residual compliance under a patch.
+The norm is relative to the compliance under the patch or to the same norm of the load, whichever
+gives more: where a thin lobe gives way, the compliance is large and hides a large error. A few
+*probes* are loads solved exactly that never enter the space. They calibrate eta as an estimate of
+the error of every load, and give the residual compliance under a patch.
 """
 
 from __future__ import annotations
@@ -42,18 +42,18 @@ WORST_OVER_MEAN = 2.0  # estimated, of the mean asked for; the true worst may be
 
 @dataclass(frozen=True)
 class ReductionRule:
-    """How large the space may become.
+    """Limits of the space's size.
 
     Attributes
     ----------
     n_start : int
-        Load functions of the neighbours.
+        Number of load functions taken from the neighbours.
     n_block : int
-        Load positions solved in one enrichment, three directions each.
+        Number of load positions solved in one enrichment, three directions each.
     n_probes : int
-        Load positions solved exactly to calibrate the estimate.
+        Number of load positions solved exactly to calibrate the estimate.
     max_solution_fraction : float
-        Fine solutions at most, probes included, over those of the full problem.
+        Largest number of fine solutions, probes included, over those of the full problem.
     supports : tuple[float, ...]
         Candidates for the reach of the residual compliance, in patch radii.
     """
@@ -67,16 +67,16 @@ class ReductionRule:
 
 @dataclass(frozen=True)
 class GalerkinErrorEstimate:
-    """Estimated relative L2 errors of displacement over all loads, and what was spent.
+    """Estimated relative L2 errors of displacement over all loads, and their cost.
 
     Attributes
     ----------
     mean, worst : float
-        Over the load positions, three directions together.
+        Errors over the load positions, three directions together.
     rank : int
         Rank of the space.
     solutions : int
-        Fine ones so far, probes included.
+        Number of fine solutions so far, probes included.
     """
 
     mean: float
@@ -88,15 +88,15 @@ class GalerkinErrorEstimate:
 class GalerkinBasis:
     """K-orthonormal space functions X of forces F A, at the vertices, and their load functions Y.
 
-    All but X itself is done with load functions, K X = F A and Y = F^T X: products of two
-    functions are Y^T A, and no product by K is needed.
+    Everything but X itself is computed with load functions, K X = F A and Y = F^T X. Products of
+    two functions are Y^T A, and no product by K is needed.
 
     Parameters
     ----------
     elasticity : Elasticity
-        Elasticity of the patient's own mesh.
-    loads : sp.csr_matrix
-        Sparse, shape (3 n_nodes, n_loads), F.
+        Problem on the patient's own mesh.
+    loads : sparse, shape (3 n_nodes, n_loads)
+        F.
     single : bool
         Solve in single precision.
 
@@ -104,8 +104,8 @@ class GalerkinBasis:
     ----------
     space : ndarray, shape (3 n_vertices, rank)
         X.
-    applied, load
-        (n_loads, rank), A and Y.
+    applied, load : ndarray, shape (n_loads, rank)
+        A and Y.
     load_norm : ndarray, shape (n_positions,)
         Root of the trace of f . D^-1 f.
     """
@@ -155,8 +155,9 @@ class GalerkinBasis:
     def residual_blocks(self) -> NDArray[np.float64]:
         """Return r(s) . D^-1 r(s) of each position, by directions, shape (n_positions, 3, 3) [m/N].
 
-        With G = F^T D^-1 F and r = F (1 - A Y^T) they are the diagonal blocks of
-        G - G A Y^T - Y A^T G + Y A^T G A Y^T.
+        With G = F^T D^-1 F and r = F (1 - A Y^T), the blocks lie on the diagonal of
+
+            G - G A Y^T - Y A^T G + Y A^T G A Y^T.
         """
         mixed = self._gram @ self.applied
         load, change = (
@@ -168,7 +169,7 @@ class GalerkinBasis:
         return np.asarray(blocks, float)  # of loads in the space, rounding would be left
 
     def compliance_trace(self) -> FloatArray:
-        """Trace of the Galerkin compliance Y Y^T of each patch, shape (n_positions,) [m/N]."""
+        """Return the trace of the Galerkin compliance Y Y^T of each patch, (n_positions,) [m/N]."""
         return np.asarray((self.load**2).sum(axis=1).reshape(-1, 3).sum(axis=1))
 
 
@@ -179,6 +180,7 @@ class Probes:
     Attributes
     ----------
     positions : ndarray of int, shape (n,)
+        Load positions.
     columns : ndarray, shape (3 n_vertices, 3 n)
         Exact displacement [m/N].
     compliance : ndarray, shape (3 n_positions, 3 n)
@@ -190,7 +192,7 @@ class Probes:
     compliance: FloatArray
 
     def errors(self, basis: GalerkinBasis) -> FloatArray:
-        """Relative mass-weighted L2 error of the Galerkin displacement at each probe, (n,)."""
+        """Return the relative mass-weighted L2 error of displacement at each probe, shape (n,)."""
         elasticity = basis.elasticity
         estimate = basis.space @ basis.load[triples(self.positions)].T
         error, size = (
@@ -207,13 +209,13 @@ class ReducedResponse:
     Attributes
     ----------
     response : CompactResponse
-        CompactResponse at the patient's vertices and load positions.
+        Response at the patient's vertices and load positions.
     support : float
         Reach of the residual compliance [m].
     history : tuple[GalerkinErrorEstimate, ...]
-        One GalerkinErrorEstimate for the first space and after each enrichment.
+        Estimates for the first space and after each enrichment.
     converged : bool
-        The last estimate is below the tolerance.
+        Whether the last estimate is below the tolerance.
     """
 
     response: CompactResponse
@@ -231,21 +233,24 @@ def reduce(
     rule: ReductionRule | None = None,
     progress: Callable[[float, GalerkinErrorEstimate], None] = lambda fraction, estimate: None,
 ) -> ReducedResponse:
-    """Return Galerkin response from the neighbours' load functions, enriched until the tolerance.
+    """Return the Galerkin response from the neighbours' load functions, enriched to a tolerance.
 
-    Stops at the tolerance (mean, and twice that for the worst load), or with ``converged``
-    False after ``max_solution_fraction`` of the fine solutions.
+    Enrichment stops at the tolerance (mean, and twice that for the worst load), or with
+    ``converged`` False after ``max_solution_fraction`` of the fine solutions.
 
     Parameters
     ----------
-    elasticity, loads, surface : Elasticity
-        Elasticity, loads and surface of the patient's own mesh.
+    elasticity : Elasticity
+        Problem on the patient's own mesh.
+    loads : sparse, shape (3 n_nodes, n_loads)
+    surface : LoadSurface
     load_functions : ndarray, shape (n_loads, n)
-        Carried over, most important first.
+        Load functions of the neighbours, most important first.
     tolerance : float
         Mean relative L2 error of displacement.
+    rule : ReductionRule or None
     progress : Callable[[float, GalerkinErrorEstimate], None]
-        Called with the fraction of the allowed solutions that is spent, and the estimate.
+        Called with the spent fraction of the allowed solutions, and the estimate.
     """
     rule = rule or ReductionRule()
     limit = max(int(rule.max_solution_fraction * loads.shape[1]), 3 * (rule.n_probes + 1))
@@ -285,8 +290,9 @@ def estimate_errors(
 ) -> GalerkinErrorEstimate:
     """Return the errors of all loads from their residuals, calibrated on the probes.
 
-    e(s) ~ c times :func:`relative_residual`, c the ratio of the means over the probes. The worst is
-    as much larger than the largest e(s) as that of the probes which is underestimated most.
+    The estimate is e(s) ~ c :func:`relative_residual`, with c the ratio of the means over the
+    probes. The worst error is the largest e(s) times the largest ratio of true to estimated error
+    among the probes.
     """
     relative, exact = relative_residual(basis, blocks), probes.errors(basis)
     estimate = exact.mean() / relative[probes.positions].mean() * relative
@@ -302,10 +308,11 @@ def is_met(estimate: GalerkinErrorEstimate, tolerance: float) -> bool:
 
 
 def relative_residual(basis: GalerkinBasis, blocks: NDArray[np.float64]) -> FloatArray:
-    """The larger of eta / sqrt(tr C) and eta / sqrt(f D^-1 f), each over its mean, (n_positions,).
+    """Return the larger of eta / sqrt(tr C) and eta / sqrt(f D^-1 f), shape (n_positions,).
 
-    The first is the error in energy if K were D, too small where the organ gives way more than D
-    says; the second is free of that, and blind to how far a load reaches.
+    Each is divided by its mean. The first is the error in energy if K were D. It is too small where
+    the organ gives way more than D says. The second is free of that, but does not know how far a
+    load reaches.
     """
     residual = np.sqrt(np.trace(blocks, axis1=1, axis2=2))
     measures = residual / np.sqrt(basis.compliance_trace()), residual / basis.load_norm
@@ -319,7 +326,7 @@ def worst_positions(
     n: int,
     excluded: NDArray[np.int64],
 ) -> NDArray[np.int64]:
-    """Load positions of the largest relative residuals, at least 1.5 patch radii apart."""
+    """Return the positions of the largest relative residuals, at least 1.5 patch radii apart."""
     left = relative_residual(basis, blocks)
     left[excluded] = 0.0  # a probe in the space would make the estimate too small
     return surface.largest_apart(left, n, 1.5 * surface.patch_radius)
@@ -332,14 +339,17 @@ def residual_compliance(
     blocks: NDArray[np.float64],
     rule: ReductionRule,
 ) -> tuple[FloatArray, float]:
-    """Return residual compliance of each patch, C - Y Y^T, and the distance over which it extends.
+    """Return the residual compliance of each patch, C - Y Y^T, and its reach.
 
-    M(s) = alpha eta-blocks(s), alpha such that the traces at the probes agree; the reach is the
-    candidate for which :func:`residual_compliance_blocks` fits the probes' columns best.
+    M(s) = alpha eta-blocks(s). The factor alpha makes the traces at the probes agree. The reach is
+    the candidate for which :func:`residual_compliance_blocks` fits the probes' columns best.
 
     Returns
     -------
-    compliance : ndarray, shape (n_positions, 3, 3) [m/N]; support : [m]
+    compliance : ndarray, shape (n_positions, 3, 3)
+        M [m/N].
+    support : float
+        Reach [m].
     """
     exact = probes.compliance - basis.load @ basis.load[triples(probes.positions)].T
     exact = exact.reshape(surface.n_positions, 3, len(probes.positions), 3)
@@ -362,19 +372,23 @@ def residual_compliance(
 def residual_compliance_blocks(
     compliance: FloatArray, support: float, surface: LoadSurface, reach: float
 ) -> LocalBlocks:
-    """The residual compliance between neighbouring patches, positive definite by construction.
+    """Return the residual compliance between neighbouring patches, positive definite.
 
         dC(s, s') = phi(|s - s'| / support) M(s)^(1/2) M(s')^(1/2)
 
-    with the taper phi: the entry-wise product of a positive definite kernel and a Gram matrix
-    (Schur). Blocks beyond the support, up to ``reach``, are kept as zeros.
+    phi is the taper. The result is the entry-wise product of a positive definite kernel and a Gram
+    matrix, therefore positive definite (Schur). Blocks beyond the support, up to ``reach``, are
+    kept as zeros.
 
     Parameters
     ----------
     compliance : ndarray, shape (n_positions, 3, 3)
-        Compliance [m/N], M.
-    support, reach : float
-        Support and reach [m].
+        M [m/N].
+    support : float
+        Distance at which phi vanishes [m].
+    surface : LoadSurface
+    reach : float
+        Largest distance of two patches with a block [m].
     """
     pairs = near_pairs(surface.centers, surface.centers, reach)
     root = _root(compliance)
@@ -394,7 +408,7 @@ def _blocks_of_triples(matrix: sp.csr_matrix) -> NDArray[np.float64]:
 
 
 def _unit_functions(loads: NDArray[np.int64], n_loads: int) -> FloatArray:
-    """Load functions of single loads, shape (n_loads, n)."""
+    """Return load functions of single loads, shape (n_loads, n)."""
     functions = np.zeros((n_loads, len(loads)))
     functions[loads, np.arange(len(loads))] = 1.0
     return functions
@@ -411,16 +425,18 @@ def _root(blocks: FloatArray) -> FloatArray:
 def compact_response(
     elasticity: Elasticity, loads: sp.csr_matrix, rank: int = 120, n_probes: int = 8
 ) -> CompactResponse:
-    """The response of one anatomy in few modes, for a base: two sweeps of a subspace iteration.
+    """Return the response of one anatomy in few modes, by two sweeps of a subspace iteration.
 
     Parameters
     ----------
     elasticity : Elasticity
-        Elasticity on the registered template.
-    loads : sp.csr_matrix
-        Sparse, shape (3 n_nodes, n_loads), patches at the registered positions.
+        Problem on the registered template.
+    loads : sparse, shape (3 n_nodes, n_loads)
+        Patches at the registered positions.
     rank : int
-        Modes, each two solutions.
+        Number of modes, two solutions each.
+    n_probes : int
+        Number of load positions solved exactly.
     """
     rank = min(rank, loads.shape[1])
     functions = np.random.default_rng(0).standard_normal((loads.shape[1], rank))

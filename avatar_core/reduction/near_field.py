@@ -1,8 +1,8 @@
-"""The exact part of the contact compliance close to a load, and the taper that lets it fade out.
+"""Near field: the exact contact compliance close to a load, and the taper that fades it out.
 
 The Gram matrix of a truncated basis is too stiff under the tool. Its error near the patch is stored
-exactly: 3 x 3 blocks for the pairs of load positions closer than a radius, faded out so that no
-jump remains.
+exactly, in 3 x 3 blocks for the pairs of load positions closer than a radius. The blocks fade out
+with distance so that no jump remains.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ class LocalBlocks:
     Attributes
     ----------
     start : ndarray of int64, shape (n_positions + 1,)
+        First block of each row.
     target : ndarray of int32, shape (n_blocks,)
         Load positions, ascending within a row.
     block : ndarray, shape (n_blocks, 3, 3)
@@ -42,7 +43,10 @@ class LocalBlocks:
         return np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
 
     def distances(self, centers: np.ndarray) -> np.ndarray:
-        """Between the two positions of every block, of positions (n, 3) [m], shape (n_blocks,)."""
+        """Return the distance between the two positions of every block, shape (n_blocks,) [m].
+
+        centers : positions (n, 3) [m]
+        """
         return np.asarray(np.linalg.norm(centers[self.position] - centers[self.target], axis=1))
 
     @property
@@ -61,14 +65,14 @@ class LocalBlocks:
 
 @dataclass(frozen=True)
 class Mirror:
-    """From the upper half of symmetric blocks to all of them.
+    """Map from the upper half of symmetric blocks to all of them.
 
     Attributes
     ----------
     start, target : ndarray
-        Start and target of all blocks.
+        Compressed rows of all blocks.
     source : ndarray, shape (n_blocks,)
-        The block of the upper half that each is, or the transpose of.
+        Number of the upper-half block that each block equals, or is the transpose of.
     turned : ndarray of bool, shape (n_blocks,)
         Whether it is the transpose.
     """
@@ -80,7 +84,7 @@ class Mirror:
 
     @classmethod
     def of(cls, start: np.ndarray, target: np.ndarray) -> Mirror:
-        """Of the compressed rows of the upper half."""
+        """Return the map for the compressed rows of the upper half."""
         n_rows = len(start) - 1
         position = np.repeat(np.arange(n_rows), np.diff(start))
         below = np.flatnonzero(target > position)
@@ -96,7 +100,7 @@ class Mirror:
         )
 
     def whole(self, block: np.ndarray) -> np.ndarray:
-        """Return all blocks, of those of the upper half (..., n_upper, 3, 3)."""
+        """Return all blocks from the upper half's blocks (..., n_upper, 3, 3)."""
         out = block[..., self.source, :, :]
         out[..., self.turned, :, :] = out[..., self.turned, :, :].swapaxes(-1, -2)
         return np.ascontiguousarray(out)
@@ -104,7 +108,7 @@ class Mirror:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Which (position, target) pairs are near, in compressed rows, and how far apart [m]."""
+    """Pairs of near positions and targets, in compressed rows, with their distance [m]."""
 
     start: np.ndarray
     target: np.ndarray
@@ -125,12 +129,12 @@ def near_pairs(positions: np.ndarray, targets: np.ndarray, radius: float) -> Pai
 
 
 def taper(distance: np.ndarray) -> np.ndarray:
-    """Return one at distance 0, zero from 1, and positive definite in space.
+    """Return a taper: one at distance 0, zero from 1 on, and positive definite in space.
 
-    The entry-wise product of two positive semi-definite matrices is positive semi-definite
-    (Schur), so tapering a residual compliance with it keeps every contact problem well posed;
-    in geostatistics this is covariance tapering (Furrer, Genton & Nychka 2006). Of all such
-    functions this one falls off least at first (Gneiting, J. Multivariate Analysis 83, 2002):
+    The entry-wise product of two positive semi-definite matrices is positive semi-definite (Schur).
+    Tapering a residual compliance therefore keeps every contact problem well posed. Geostatistics
+    calls it covariance tapering (Furrer, Genton & Nychka 2006). This taper falls off least at first
+    of all such functions (Gneiting, J. Multivariate Analysis 83, 2002):
 
         (1 - r) sin(2 pi r) / (2 pi r) + (1 - cos(2 pi r)) / (2 pi^2 r)
     """
@@ -143,12 +147,12 @@ _HASH = 2654435761  # Knuth's multiplicative hashing, The Art of Computer Progra
 
 
 def hash_rows(near: LocalBlocks) -> tuple[np.ndarray, np.ndarray]:
-    """Return the open-addressing tables by which a compiled loop finds one block of a row at once.
+    """Return open-addressing tables by which a compiled loop finds one block of a row at once.
 
     Returns
     -------
     start : ndarray of int64, shape (n_rows + 1,)
-        Slots of each row, a power of two.
+        First slot of each row; a row has a power of two slots.
     slot : ndarray of int32, shape (n_slots, 2)
         Target (-1: empty) and index of its block.
     """
@@ -174,7 +178,7 @@ def _fill_slots(row_start, target, start, slot):  # type: ignore[no-untyped-def]
 
 @inlined
 def find_block(start, slot, row, target):  # type: ignore[no-untyped-def]
-    """Index of the block of a row and target in the tables of :func:`hash_rows`, or -1."""
+    """Return the block of a row and target in the tables of :func:`hash_rows`, or -1."""
     mask = start[row + 1] - start[row] - 1
     k = (np.int64(target) * _HASH >> 16) & mask
     while True:

@@ -1,17 +1,19 @@
 """Proper Generalized Decomposition over load position (paper Sec. 2.1).
 
 For K u(s) = f(s) with u(x, s) = sum_k X_k(x) Y_k(s), each enrichment R(x) S(s) minimizes the
-weighted energy of what is left (paper Eqs. 7-14, with one scalar S per load instead of the
-entry-wise product, to which it collapses when each load has one direction):
+weighted energy of the residual (paper Eqs. 7-14). One scalar S per load replaces the paper's
+entry-wise product, which reduces to it when each load has one direction:
 
     S known:  K R = sum_s w(s) S(s) r(s) / sum_s w(s) S(s)^2        (Eq. 14)
     R known:  S(s) = R . r(s) / (R . K R)                           (Eq. 11)
 
-with the residual r = f - K u^m. Space functions are kept K-orthonormal, so that the Galerkin
-update of *all* load functions is Y_k(s) = X_k . f(s), the residual energy is known exactly, and
-alternating directions are a power iteration for the next eigenvector of the residual's energy.
-Eigenvalues lie close together, so a single pair converges slowly: ``block`` pairs are sought at
-once (a subspace iteration, each pair normalized against the others). ``block = 1`` is the paper's.
+with the residual r = f - K u^m. Space functions are kept K-orthonormal. The Galerkin update of
+*all* load functions is then Y_k(s) = X_k . f(s), and the residual energy is known exactly.
+Alternating directions become a power iteration for the next eigenvector of the residual's energy.
+
+Eigenvalues lie close together, so a single pair converges slowly. Therefore ``block`` pairs are
+sought at once (a subspace iteration, each pair normalized against the others). ``block = 1`` is the
+paper's method.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ _ROUNDING = 1e-13
 
 
 class EnrichmentStatus(Enum):
-    """How an enrichment ended."""
+    """Outcome of an enrichment."""
 
     CONVERGED = "converged"
     SWEEP_LIMIT = "sweep limit"  # accepted: the mode still lowers the energy, less than it could
@@ -42,12 +44,15 @@ class EnrichmentStatus(Enum):
 
 @dataclass(frozen=True)
 class EnrichmentReport:
-    """One greedy enrichment: its status, the sweeps it took and what was left after it.
+    """Report of one greedy enrichment: its status, its sweeps and the remaining error.
 
     Attributes
     ----------
+    status : EnrichmentStatus
+    sweeps : int
+        Number of alternating sweeps.
     modes : int
-        Pairs added.
+        Number of pairs added.
     change : float
         Relative change of the energy that R S captures, in the last sweep.
     energy_error : float
@@ -63,20 +68,20 @@ class EnrichmentReport:
 
 @dataclass(frozen=True)
 class PGDRule:
-    """When to stop.
+    """Stopping criteria of the enrichments.
 
     Attributes
     ----------
     max_modes : int
-        Pairs at most.
+        Largest number of pairs.
     tolerance : float
-        Stop when the relative energy error is below.
+        Relative energy error below which enrichment stops.
     block : int
-        Pairs sought at once.
+        Number of pairs sought at once.
     max_sweeps : int
-        Alternating directions per enrichment at most.
+        Largest number of alternating sweeps per enrichment.
     sweep_tolerance : float
-        An enrichment has converged when the energy it captures changes less.
+        Relative change of the captured energy below which an enrichment has converged.
     """
 
     max_modes: int
@@ -88,13 +93,14 @@ class PGDRule:
 
 @dataclass(frozen=True)
 class PGDSolution:
-    """K-orthonormal space functions, their load functions, and the history that led there.
+    """K-orthonormal space functions, their load functions, and the enrichments that gave them.
 
     Attributes
     ----------
     space : ndarray, shape (3 n_nodes, rank)
-        Or as the problem writes it.
+        X, or as the problem writes it.
     load : ndarray, shape (n_loads, rank)
+        Y.
     """
 
     space: np.ndarray
@@ -103,12 +109,12 @@ class PGDSolution:
 
     @property
     def converged(self) -> bool:
-        """Every enrichment that was made reached its own sweep tolerance."""
+        """Whether every enrichment reached its own sweep tolerance."""
         return all(report.status is not EnrichmentStatus.SWEEP_LIMIT for report in self.history)
 
 
 class _Expansion:
-    """The growing K-orthonormal expansion and the energy that it leaves to each load."""
+    """The growing K-orthonormal expansion, and the residual energy of each load."""
 
     def __init__(self, problem: PGDProblem, capacity: int) -> None:
         self.problem = problem
@@ -134,7 +140,7 @@ class _Expansion:
         return float(np.sqrt(left / (weights @ total)))
 
     def append(self, space: np.ndarray) -> int:
-        """Make space functions K-orthonormal and add them; the number of those that were new.
+        """Add space functions, made K-orthonormal; return the number of new ones.
 
         Raises ConvergenceError if the modes do not come out orthonormal.
         """
@@ -157,31 +163,23 @@ class _Expansion:
 
 
 class PGDProblem(Protocol):
-    """K u(s) = f(s) for all loads s, as alternating directions need it.
-
-    Attributes
-    ----------
-    shape : tuple[int, int]
-        Numbers of entries of a space function, and of loads.
-    weights : ndarray, shape (n_loads,)
-        Positive, of each load in the norm over s.
-    energy : ndarray, shape (n_loads,)
-        f(s) . K^-1 f(s) [J], the patch compliance.
-    rounding : float
-        By which orthonormal functions may be off.
-    """
+    """Interface of K u(s) = f(s) for all loads s, for alternating directions."""
 
     @property
-    def weights(self) -> np.ndarray: ...
+    def weights(self) -> np.ndarray:
+        """Positive weight of each load in the norm over s, shape (n_loads,)."""
 
     @property
-    def energy(self) -> np.ndarray: ...
+    def energy(self) -> np.ndarray:
+        """f(s) . K^-1 f(s), the patch compliance, shape (n_loads,) [J]."""
 
     @property
-    def shape(self) -> tuple[int, int]: ...
+    def shape(self) -> tuple[int, int]:
+        """Numbers of entries of a space function, and of loads."""
 
     @property
-    def rounding(self) -> float: ...
+    def rounding(self) -> float:
+        """Allowed error of orthonormality."""
 
     def solve(self, amounts: np.ndarray) -> np.ndarray:
         """Return the space functions K^-1 sum_s f(s) a(s) of amounts a, shape (n_loads, n)."""
@@ -200,9 +198,9 @@ class LoadProblem:
     Attributes
     ----------
     elasticity : Elasticity
-        Solves with and applies K.
-    loads : sp.csr_matrix
-        Sparse, shape (3 n_nodes, n_loads).
+        Problem that solves with K and applies it.
+    loads : sparse, shape (3 n_nodes, n_loads)
+        Right-hand sides.
     """
 
     elasticity: Elasticity
@@ -212,19 +210,24 @@ class LoadProblem:
 
     @property
     def shape(self) -> tuple[int, int]:
+        """Numbers of entries of a space function, and of loads."""
         return self.loads.shape
 
     @property
     def rounding(self) -> float:
+        """Allowed error of orthonormality."""
         return 1e-6
 
     def solve(self, amounts: np.ndarray) -> np.ndarray:
+        """Return K^-1 F a."""
         return self.elasticity.solve(self.loads @ amounts)
 
     def observe(self, space: np.ndarray) -> np.ndarray:
+        """Return F^T X."""
         return np.asarray(self.loads.T @ space)
 
     def apply(self, space: np.ndarray) -> np.ndarray:
+        """Return K X."""
         return self.elasticity.apply(space)
 
 
@@ -232,14 +235,13 @@ class LoadProblem:
 class SolvedLoads:
     """A problem whose loads have all been solved: a sweep costs a product, not a solution.
 
-    A space function is written as the amounts c of the loads' solutions that it consists of,
-    X = K^-1 F c. Its products with the loads are C c, with C = F^T K^-1 F; in energy,
-    X . K X' = c . C c'.
+    A space function X = K^-1 F c is written as its amounts c of the loads' solutions. Its products
+    with the loads are C c, with C = F^T K^-1 F; in energy, X . K X' = c . C c'.
 
     Attributes
     ----------
     compliance : ndarray, shape (n_loads, n_loads)
-        C, symmetric; in single precision, modes are orthonormal to 1e-2 only, and those of little
+        C, symmetric. In single precision, modes are orthonormal to 1e-2 only, and modes of little
         energy are not found.
     """
 
@@ -249,16 +251,20 @@ class SolvedLoads:
 
     @property
     def shape(self) -> tuple[int, int]:
+        """Numbers of entries of a space function, and of loads."""
         return self.compliance.shape[0], self.compliance.shape[1]
 
     @property
     def rounding(self) -> float:
+        """Allowed error of orthonormality, by the precision of C."""
         return 1e-6 if self.compliance.dtype == np.float64 else 1e-2
 
     def solve(self, amounts: np.ndarray) -> np.ndarray:
+        """Return the amounts, which represent K^-1 F a."""
         return amounts
 
     def observe(self, space: np.ndarray) -> np.ndarray:
+        """Return C c."""
         return np.asarray(self.compliance @ space.astype(self.compliance.dtype), float)
 
     apply = observe
@@ -267,7 +273,7 @@ class SolvedLoads:
 def solve_pgd(
     problem: PGDProblem, rule: PGDRule, progress: Callable[[int], None] = lambda rank: None
 ) -> PGDSolution:
-    """Return the greedy enrichment with alternating directions until the rule stops it.
+    """Enrich greedily with alternating directions until the rule stops it; return the solution.
 
     Parameters
     ----------
@@ -297,7 +303,7 @@ def solve_pgd(
 
 
 def _enrich(expansion: _Expansion, rule: PGDRule) -> EnrichmentReport:
-    """Return one enrichment: start at random loads with energy left, alternate, keep the result."""
+    """Run one enrichment: start at random loads with energy left, alternate, keep the result."""
     problem = expansion.problem
     rounding = _ROUNDING * float(problem.weights @ problem.energy)
     load = _start(expansion, min(rule.block, rule.max_modes - expansion.rank))
@@ -320,7 +326,7 @@ def _above_rounding(
 ) -> np.ndarray:
     """Return the combinations of a block's pairs that capture more energy than rounding does.
 
-    A block may ask for more than is left; what it then holds beside that is noise.
+    A block may ask for more pairs than are left; its other combinations are noise.
     """
     energy, mixing = np.linalg.eigh(load.T @ (weights[:, None] * load))
     if energy[0] > rounding:
@@ -329,17 +335,17 @@ def _above_rounding(
 
 
 def _start(expansion: _Expansion, block: int) -> np.ndarray:
-    """Return the random load functions, larger where more energy is left."""
+    """Return random load functions, larger where more energy is left."""
     rng = np.random.default_rng(expansion.rank)
     left = np.sqrt(np.maximum(expansion.energy, 0.0))
     return left[:, None] * rng.standard_normal((len(left), block))
 
 
 def _sweep(expansion: _Expansion, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Alternating directions: R from S (Eq. 14), K-orthonormal within the block, S from R (11).
+    """Alternate directions once: R from S (Eq. 14), K-orthonormal in the block, S from R (Eq. 11).
 
-    K R = sum_s w S r(s) is solved as R = K^-1 sum_s w S f(s) - sum_k X_k (Y_k . w S), and its
-    energy R . K R equals (F^T R) . w S, so that no product with K is needed.
+    K R = sum_s w S r(s) is solved as R = K^-1 sum_s w S f(s) - sum_k X_k (Y_k . w S). Its energy R
+    . K R equals (F^T R) . w S, so that no product with K is needed.
     """
     problem = expansion.problem
     weighted = problem.weights[:, None] * load

@@ -2,14 +2,15 @@
 
     u(x, s_j) ~ sum_m Z_m(x) W_m(s_j),    m over the modes of the region that holds s_j.
 
-Loads near one another move an organ alike: some dozen modes for each of some dozen regions leave
-less than hundreds of modes for all loads at once, and a step reads only those of the tip's region.
-Each load position belongs to one region. Between positions the response is interpolated as ever, so
-that it is as smooth where a tip crosses from one region to the next as it is within one.
+Loads near one another move an organ alike. Some dozen modes for each of some dozen regions leave a
+smaller error than hundreds of modes for all loads at once, and a step reads only the modes of the
+tip's region. Each load position belongs to one region. Between positions the response is
+interpolated. It is therefore as smooth where a tip crosses between regions as within one.
 :mod:`avatar_core.reduction.block_field` separates these modes once more, in space.
 
 The modes of a region are the principal components of its columns (Eckart & Young, Psychometrika 1,
-1936), each column divided by its own size: they leave the least relative error that so many can.
+1936). Each column is divided by its own size, so that the relative error is the least for that
+number of modes.
 """
 
 from __future__ import annotations
@@ -45,16 +46,16 @@ class RegionModes(NamedTuple):
 
 @dataclass(frozen=True)
 class RegionalRule:
-    """How many modes a region gets.
+    """Accuracy and size of a region's modes.
 
     Attributes
     ----------
     tolerance : float
         Mean relative L2 error over the region's loads.
     worst : float
-        Worst of its worst load.
+        Relative L2 error of the region's worst load.
     most : int
-        Modes of a region at most.
+        Largest number of modes of a region.
     """
 
     tolerance: float
@@ -63,7 +64,7 @@ class RegionalRule:
 
 
 def regions_of(centers: FloatArray, n_regions: int) -> IntArray:
-    """Regions of load positions that lie together, by k-means, shape (n_positions,) int32."""
+    """Return compact regions of load positions, by k-means, shape (n_positions,) int32."""
     n_regions = max(1, min(n_regions, len(centers)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a region may come out empty: it is dropped
@@ -84,20 +85,24 @@ def separate_regions(
     Parameters
     ----------
     region : ndarray of int32, shape (n_positions,)
+        Region of each load position.
     columns : Callable[[ndarray of int], ndarray]
-        Columns of some positions, shape (3 n_vertices, n, n_loads).
+        Function that returns the columns of some positions, shape (3 n_vertices, n, n_loads).
     size : ndarray, shape (n_positions, n_loads)
-        L2 norm by which an error is relative.
+        L2 norms to which errors are relative.
     mass : ndarray, shape (3 n_vertices,)
-        Lumped.
+        Lumped mass.
+    rule : RegionalRule
+    progress : Callable[[float], None]
+        Called with the finished fraction.
 
     Returns
     -------
     modes : list[RegionModes]
         Modes of each region.
     errors : ndarray, shape (most + 1, n_positions, n_loads)
-        Relative L2 error that so many modes of its region leave each load; those beyond the modes
-        kept leave what is left.
+        Relative L2 error of each load by number of its region's modes; constant beyond the modes
+        kept.
     """
     parts = []
     errors = np.empty((rule.most + 1, *size.shape))
@@ -120,7 +125,7 @@ def separate_regions(
 def _principal(
     columns: FloatArray, rule: RegionalRule
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Modes (n_dofs, k), their amounts in each column (n, k), and the errors (most + 1, n)."""
+    """Return modes (n_dofs, k), their amounts in each column (n, k), and errors (most + 1, n)."""
     gram = (columns.T @ columns).astype(float)
     value, vector = np.linalg.eigh(gram)
     value, vector = np.maximum(value[::-1], 0.0), vector[:, ::-1]
@@ -137,7 +142,10 @@ def _principal(
 
 
 def _with_peaks_of_one(modes: FloatArray, amounts: FloatArray, size: FloatArray) -> RegionModes:
-    """Return modes (n_dofs, k), by the amounts (n, k) of them in scaled columns of some sizes."""
+    """Return the region's modes from modes (n_dofs, k) and their amounts (n, k) in scaled columns.
+
+    size : size by which each column was divided
+    """
     peak = np.maximum(np.abs(modes).max(axis=0, initial=0.0), 1e-30)
     load = amounts.reshape(*size.shape, -1) * size[..., None] * peak
     return RegionModes(modes / peak, load.astype(np.float32))

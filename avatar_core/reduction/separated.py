@@ -50,16 +50,16 @@ class SeparatedField:
     def mixing_by_norm(
         self, space_mass: np.ndarray, load_mass: np.ndarray | None = None
     ) -> np.ndarray:
-        """The orthogonal mixing that sorts modes by their weighted L2 norm, shape (rank, rank).
+        """Return the orthogonal mixing that sorts modes by weighted L2 norm, shape (rank, rank).
 
         It is the Q of B^T R = Q T, with X^T M X = A^T A, Y^T W Y = B^T B and the singular value
-        decomposition A B^T = P S R^T. As Q is orthogonal, Y Y^T does not change, and the leading
-        modes still span a Galerkin subspace.
+        decomposition A B^T = P S R^T. Q is orthogonal. Therefore Y Y^T does not change, and the
+        leading modes still span a Galerkin subspace.
 
         Parameters
         ----------
         space_mass : ndarray, shape (n_dofs,)
-            Lumped, M.
+            M, lumped.
         load_mass : ndarray, shape (n_loads,)
             W; by default 1 / |u|^2 of each load in M, which makes the norm one of relative errors.
         """
@@ -72,5 +72,5 @@ class SeparatedField:
 
 
 def _gram_root(factor: np.ndarray, mass: np.ndarray) -> np.ndarray:
-    """Return a with A^T A = factor^T M factor, also where the factor is rank deficient."""
+    """Return A with A^T A = factor^T M factor, also where the factor is rank deficient."""
     return np.asarray(np.linalg.qr(np.sqrt(mass)[:, None] * factor, mode="r"))

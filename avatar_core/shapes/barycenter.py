@@ -1,4 +1,4 @@
-"""Barycentric weights: one shape written in terms of its neighbours.
+"""Barycentric weights: a shape as a weighted sum of its neighbours.
 
 Shapes are vectors, here the signed distances at the points of one grid. Weights follow Eq. 15 of
 Gonzalez, Cueto & Chinesta (2015), after Roweis & Saul (2000), Science 290:2323.
@@ -24,13 +24,14 @@ SAME = 1e-6  # vectors closer than this times the size of the base are equal: 0.
 
 @dataclass(frozen=True, eq=False)
 class Barycenter:
-    """One shape as x ~ sum_j w_j X_j with sum_j w_j = 1, and measures of how far to trust it.
+    """A shape as x ~ sum_j w_j X_j with sum_j w_j = 1, and measures of its reliability.
 
     Attributes
     ----------
     neighbors : ndarray of int, shape (k,)
-        Nearest first.
+        Neighbours, the nearest first.
     weights : ndarray, shape (k,)
+        w_j.
     distances : ndarray, shape (k,)
         |x - X_j|, in the unit of the vectors (2-norm).
     residual : float
@@ -38,11 +39,12 @@ class Barycenter:
     hull_distance : float
         Distance of x from the convex hull of the neighbours; 0 inside.
     condition : float
-        Number of the local Gram matrix before regularisation; inf if singular, 1 for a member.
+        Condition number of the local Gram matrix before regularisation; inf if singular, 1 for a
+        member.
     member : int or None
         Number of the member that equals x and has weight 1; None if there is none.
     notices : tuple[str, ...]
-        How the result differs from the request, one line each.
+        Differences of the result from the request, one line each.
     """
 
     neighbors: IntArray
@@ -56,11 +58,11 @@ class Barycenter:
 
     @property
     def absolute_sum(self) -> float:
-        """sum |w|, which bounds the amplification of errors of the neighbours; 1 if convex."""
+        """Sum of |w|, which bounds the amplification of errors of the neighbours; 1 if convex."""
         return float(np.abs(self.weights).sum())
 
     def combine(self, values: Sequence[ArrayLike] | FloatArray) -> FloatArray:
-        """Eq. 18, sum_j w_j values[j]; a member of the base gets exactly its own value.
+        """Return sum_j w_j values[j] (Eq. 18); a member of the base gets exactly its own value.
 
         Parameters
         ----------
@@ -87,14 +89,14 @@ def local_gram(point: FloatArray, neighbors: Vectors) -> FloatArray:
 def barycenter_weights(gram: FloatArray, regularization: float) -> FloatArray:
     """Return the weights of Eq. 15: min w^T C w with sum w = 1, from (C + r tr(C) I) w ~ 1.
 
-    Returns ndarray, shape (..., k). Raises LLEError if r lies outside (0, 1].
+    The result has the shape (..., k). Raises LLEError if r lies outside (0, 1].
 
     Parameters
     ----------
     gram : ndarray, shape (..., k, k)
         Local Gram matrices C.
     regularization : float
-        r > 0, part of the trace added to the diagonal; divides weight evenly among equal
+        r > 0, the fraction of the trace added to the diagonal. It divides weight evenly among equal
         neighbours, and keeps the condition number below 1 / r.
     """
     require_regularization(regularization)
@@ -110,8 +112,8 @@ def barycenter_weights(gram: FloatArray, regularization: float) -> FloatArray:
 def convex_weights(gram: FloatArray) -> FloatArray:
     """Return weights w >= 0, sum w = 1, of the point of the convex hull closest to x, shape (k,).
 
-    With C = A^T A, the non-negative least squares min |A v|^2 + (1 - sum v)^2 has its minimum at
-    v = w t: along a ray t w it is q / (1 + q), which grows with q = w^T C w.
+    Let C = A^T A. The non-negative least squares min |A v|^2 + (1 - sum v)^2 have their minimum at
+    v = w t. Along a ray t w the minimum is q / (1 + q), which grows with q = w^T C w.
     """
     scale = float(np.trace(gram)) or 1.0
     values, vectors = np.linalg.eigh(gram / scale)
@@ -144,14 +146,15 @@ def barycenter(
     ----------
     vectors : Vectors
         The base, n arrays of shape (D,).
-    point : array_like
-        Shape (D,).
+    point : array_like, shape (D,)
     n_neighbors : int
         k, truncated to the size of the base with a notice.
+    regularization : float
+        See :func:`barycenter_weights`.
     convex : bool
-        Non-negative weights; regularization is then not used.
+        Whether weights are non-negative; regularization is then not used.
     leave_out : Collection[int]
-        Members that get no weight, such as other scans of the same patient.
+        Members that get no weight, e.g. other scans of the same patient.
     """
     x = checked_vector(point, vectors)
     require_regularization(regularization)
@@ -211,7 +214,7 @@ def _condition(gram: FloatArray) -> float:
 
 
 def checked_vector(point: ArrayLike, vectors: Vectors) -> FloatArray:
-    """The point as an array; raises LLEError unless it is finite and as long as the vectors."""
+    """Return point as an array; raise LLEError unless it is finite and of the vectors' length."""
     x = np.asarray(point, dtype=np.float64)
     if len(vectors) == 0:
         raise LLEError("lle: the base is empty; add at least one anatomy")

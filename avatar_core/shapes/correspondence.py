@@ -1,7 +1,8 @@
 """Transfer from a registered template to a patient: clamp, load positions, fields on the mesh.
 
-The registered template and the patient's own mesh fill the same organ. A point of one has
-barycentric coordinates l_k in the other; outside, those of the closest point of the surface:
+The registered template and the patient's own mesh fill the same organ. A point of one mesh has
+barycentric coordinates l_k in the other. A point outside takes those of the closest point of the
+surface:
 
     u_patient(x) = sum_k l_k(x) u_template,k
 
@@ -29,9 +30,9 @@ _PIECES = 3  # a patient's face is split into 3^2 pieces, whose majority decides
 def carry_regions(registration: Registration, patient: TetMesh) -> Regions:
     """Return the clamped and accessible faces of the patient's mesh, from those of the template.
 
-    Accessible faces that touch the clamp and islands below 5 % of the accessible area are dropped,
-    as by the anatomical rule. Parameters and errors as of :func:`carry_faces`; RegistrationError
-    if a region would be empty, too.
+    Accessible faces that touch the clamp, and islands below 5 % of the accessible area, are dropped
+    like by the anatomical rule. For parameters and errors see :func:`carry_faces`.
+    RegistrationError is also raised if a region would be empty.
     """
     regions = registration.template.regions
     parts = {"clamped": regions.clamped, "accessible": regions.accessible}
@@ -50,18 +51,18 @@ def carry_regions(registration: Registration, patient: TetMesh) -> Regions:
 def carry_faces(
     registration: Registration, patient: TetMesh, parts: Mapping[str, NDArray[np.bool_]]
 ) -> dict[str, NDArray[np.bool_]]:
-    """Parts of the template's surface on the patient's mesh, by name, each of shape (n_faces,).
+    """Return parts of the template's surface on the patient's mesh, by name, (n_faces,) each.
 
-    Each piece of a patient's face belongs to what the closest registered face belongs to, and the
-    face to what most of its pieces do.
+    Each piece of a patient's face takes the part of the closest registered face. The face takes the
+    part of most of its pieces.
 
     Parameters
     ----------
     registration : Registration
     patient : TetMesh
-        TetMesh of the surface that was registered to.
+        Mesh of the surface that was registered to.
     parts : Mapping[str, ndarray of bool]
-        Ndarrays of bool over the template's boundary faces.
+        Masks over the template's boundary faces.
 
     Raises
     ------
@@ -80,11 +81,14 @@ def carry_faces(
 
 
 def registered_positions(registration: Registration, loads: LoadSurface) -> FloatArray:
-    """The template's load positions on the registered template: vertices, then edge midpoints.
+    """Return the template's load positions on the registered template.
+
+    Vertices come first, then edge midpoints.
 
     Returns
     -------
-    ndarray, shape (n_positions, 3) [m]
+    ndarray, shape (n_positions, 3)
+        Positions [m].
 
     Raises
     ------
@@ -109,21 +113,22 @@ def registered_positions(registration: Registration, loads: LoadSurface) -> Floa
 
 
 def interpolation_matrix(mesh: TetMesh, points: FloatArray) -> sp.csr_matrix:
-    """Return the interpolation of nodal fields of a mesh at points.
+    """Return the matrix that interpolates nodal fields of a mesh at points.
 
-    Points in a tetrahedron take its barycentric coordinates, points outside those of the closest
+    A point in a tetrahedron takes its barycentric coordinates, a point outside those of the closest
     point of the surface.
 
     Parameters
     ----------
     mesh : TetMesh
-        Mesh for instance the registered template.
+        Mesh of the field, e.g. the registered template.
     points : ndarray, shape (n, 3)
-        Points [m], for instance the vertices of the patient's own mesh.
+        Points [m], e.g. the vertices of the patient's own mesh.
 
     Returns
     -------
-    sparse, shape (n, n_vertices), rows sum to one
+    sparse, shape (n, n_vertices)
+        Matrix whose rows sum to one.
     """
     corners, weights = carriers(mesh, points)
     rows = np.repeat(np.arange(len(points)), 4)
@@ -134,20 +139,21 @@ def interpolation_matrix(mesh: TetMesh, points: FloatArray) -> sp.csr_matrix:
 def load_map(registration: Registration, loads: LoadSurface, points: FloatArray) -> sp.csr_matrix:
     """Return interpolation from the template's load positions to points of the patient's surface.
 
-    Uses the shape functions of the loads, at the closest point of the registered template's
+    It uses the shape functions of the loads, at the closest point of the registered template's
     accessible faces.
 
     Parameters
     ----------
     registration : Registration
     loads : LoadSurface
-        LoadSurface of the template's mesh and regions.
+        Load positions of the template's mesh and regions.
     points : ndarray, shape (n, 3)
         Points [m].
 
     Returns
     -------
-    sparse, shape (n, n_positions), rows sum to one
+    sparse, shape (n, n_positions)
+        Matrix whose rows sum to one.
 
     Raises
     ------

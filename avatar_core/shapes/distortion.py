@@ -2,10 +2,10 @@
 
     W(x) = sum_t V_t / V  sum_i 1/2 (s_i^2 + s_i^-2 - 2)
 
-with s_i the singular values of the deformation gradient F of tetrahedron t (Smith and Schaefer,
+Here s_i are the singular values of the deformation gradient F of tetrahedron t (Smith and Schaefer,
 "Bijective parameterization with free boundaries", 2015). W is invariant to rigid motions, penalises
-stretch and compression equally, and is unbounded as a tetrahedron flattens: a line search on it
-never inverts one.
+stretch and compression equally, and is unbounded as a tetrahedron flattens. A line search on W
+therefore never inverts a tetrahedron.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import scipy.sparse as sp
 from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.common.jit import compiled
 
-_LEAST_CURVATURE = 1e-3  # replaces that of concave modes; a stretch has 4
+_LEAST_CURVATURE = 1e-3  # least curvature of concave modes; a stretch has 4
 
 
 class Distortion:
@@ -25,7 +25,7 @@ class Distortion:
     Parameters
     ----------
     reference : ndarray, shape (n_vertices, 3)
-        Reference [m], positively oriented with ``tets``.
+        Reference positions [m], positively oriented with ``tets``.
     tets : ndarray of int, shape (n_tets, 4)
     """
 
@@ -42,7 +42,7 @@ class Distortion:
         self._pattern()
 
     def _pattern(self) -> None:
-        """Sparsity of the Hessian, and position of each element entry in it."""
+        """Compute the Hessian's sparsity, and the position of each element entry in it."""
         n = 3 * self.n_vertices
         key = np.repeat(self._dofs, 12, axis=1).ravel() * n + np.tile(self._dofs, (1, 12)).ravel()
         self._entries, self._place = np.unique(key, return_inverse=True)
@@ -51,11 +51,11 @@ class Distortion:
 
     @property
     def n_entries(self) -> int:
-        """Of the Hessian that are stored."""
+        """Number of stored entries of the Hessian."""
         return len(self._entries)
 
     def matrix(self, values: FloatArray) -> sp.csr_matrix:
-        """Sparse matrix of the Hessian's pattern, symmetric, (3 n_vertices, 3 n_vertices)."""
+        """Return a symmetric matrix of the Hessian's pattern, (3 n_vertices, 3 n_vertices)."""
         n = 3 * self.n_vertices
         return sp.csr_matrix((values, self._columns, self._starts), shape=(n, n))
 
@@ -70,7 +70,7 @@ class Distortion:
         return np.swapaxes(positions[self.tets], 1, 2) @ self._gradients
 
     def jacobians(self, positions: FloatArray) -> FloatArray:
-        """det F, the volume of each tetrahedron over its reference volume, shape (n_tets,)."""
+        """Return det F of each tetrahedron, its volume over the reference one, shape (n_tets,)."""
         return np.linalg.det(self.deformation_gradient(positions))
 
     def energy(self, positions: FloatArray) -> float:
@@ -78,13 +78,14 @@ class Distortion:
         return float(_energy(self.deformation_gradient(positions), self._weight))
 
     def derivatives(self, positions: FloatArray) -> tuple[FloatArray, sp.csr_matrix]:
-        """Gradient (3 n_vertices,) and positive definite Hessian (3 n_vertices, 3 n_vertices).
+        """Return the gradient and the positive definite Hessian.
 
-        In the frame of the singular vectors, the Hessian of an isotropic energy is diagonal except
-        for the stretches, which do not couple here: f''(s_i) for stretches,
-        (f'(a) - f'(b)) / (a - b) for shears, (f'(a) + f'(b)) / (a + b) for twists. Only twists
-        can be negative, and are then raised to a small positive value (Smith, De Goes, Kim,
-        "Analytic eigensystems for isotropic distortion energies", 2019).
+        Shapes (3 n_vertices,) and (3 n_vertices, 3 n_vertices). In the frame of the singular
+        vectors, the Hessian of an isotropic energy is diagonal except for the stretches, which do
+        not couple here. Its entries are f''(s_i) for stretches, (f'(a) - f'(b)) / (a - b) for
+        shears, and (f'(a) + f'(b)) / (a + b) for twists. Only twists can be negative. They are then
+        raised to a small positive value (Smith, De Goes, Kim, "Analytic eigensystems for isotropic
+        distortion energies", 2019).
         """
         left, s, right = np.linalg.svd(self.deformation_gradient(positions))
         stress = (left * (s - s**-3)[:, None, :]) @ right * self._weight[:, None, None]
@@ -101,7 +102,7 @@ class Distortion:
 
 @compiled()
 def _energy(deformation, weight):  # type: ignore[no-untyped-def]
-    """sum_t w_t (|F|^2 + |F^-1|^2 - 6) / 2; F^-1 is the transpose of the cofactors over det F."""
+    """Return sum_t w_t (|F|^2 + |F^-1|^2 - 6) / 2, with F^-1 from the cofactors and det F."""
     total = 0.0
     for t in range(len(weight)):
         f = deformation[t]
@@ -150,7 +151,7 @@ def _add_hessians(left, s, along, weight, place, values):  # type: ignore[no-unt
 
 @compiled()
 def _set_change(u, q, v, p, sign, change):  # type: ignore[no-untyped-def]
-    """u_a q_k + sign v_a p_k, of component a of corner k."""
+    """Write u_a q_k + sign v_a p_k, the change of component a of corner k."""
     for k in range(4):
         for a in range(3):
             change[3 * k + a] = u[a] * q[k] + sign * v[a] * p[k]

@@ -1,13 +1,14 @@
-"""Elastic registration of a template liver to another: the same mesh, each vertex at its place.
+"""Elastic registration of a template liver to another one: the same mesh with moved vertices.
 
     min over x of  stiffness W(x) + 1/2 sum_i w_i |x_i - c_i|^2 + 1/2 sum_j w_j |p_j - q_j|^2
 
-W is the distortion of the tetrahedra against the aligned template, c_i the point of the target
+W is the distortion of the tetrahedra against the aligned template. c_i is the point of the target
 nearest to surface vertex i, and p_j(x) the point of the template's surface nearest to target sample
 q_j. Distances count along the surface normal, and in both directions, so that thin lobes are
-filled. In the last stages, samples that are not reached pull the template straight to them, as the
-normals of a tip's two faces lengthen nothing. The stiffness falls stage by stage. As W is infinite
-on a flat tetrahedron and every step lowers the sum, no tetrahedron inverts.
+filled. In the last stages, samples that are not reached pull the template straight to them, because
+springs along the normals of a tip's two faces do not lengthen the tip. The stiffness falls stage by
+stage. W is infinite on a flat tetrahedron and every step lowers the sum, so that no tetrahedron
+inverts.
 """
 
 from __future__ import annotations
@@ -55,33 +56,33 @@ class RegistrationRule:
     Attributes
     ----------
     first_stiffness, last_stiffness : float
-        First stiffness and last stiffness of the distortion against the distances, both made
-        dimensionless with the cube root of the target's volume.
+        Stiffness of the distortion against the distances in the first and the last stage. Both
+        terms are dimensionless by the cube root of the target's volume.
     n_stages, sweeps : int
-        The stiffness falls by equal factors in ``n_stages`` of ``sweeps`` steps.
+        Number of stages, over which the stiffness falls by equal factors, and of steps in each.
     last_sweeps : int
-        Last sweeps of steps that follow in the last stage, until the tolerance and the reach are
+        Largest number of further steps in the last stage, until the tolerance and the reach are
         met.
     tolerance : float
         Mean node-to-surface distance at which the registration has converged [m].
     reach : float
         Distance from a target sample beyond which the template is pulled straight to it [m].
     largest_mean, largest_reverse_mean : float
-        Mean distance beyond which a registration has failed, from the template's vertices to the
-        target and from the target to the template's faces [m].
+        Mean distances beyond which a registration has failed: from the template's vertices to the
+        target, and from the target to the template's faces [m].
     least_jacobian : float
         Volume of a tetrahedron over its aligned one below which it has failed.
     largest_distortion : float
         W above which the target is not of the template's kind; 64 livers measure 0.21 to 0.85, a
         torus 2.4.
     n_samples : int
-        Springs from the target; three times as many samples are searched for the nearest.
+        Number of springs from the target; three times as many samples are searched for the nearest.
     normal_length : float
         Distance that a normal turned by one radian counts as [m].
     tangential : float
         Stiffness of springs along the surface over that across it in the first stage; falls to 0.
     exact_stiffness : float
-        Below it, the nearest point is sought on the target's triangles.
+        Stiffness below which the nearest point is sought on the target's triangles.
     rotation_spread : float
         Standard deviation of the rotation between patients lying alike [deg].
     """
@@ -120,7 +121,7 @@ class RegistrationStep:
     stiffness : float
         Stiffness of the stage.
     objective : float
-        After the step, with the springs of the step.
+        Objective after the step, with the springs of the step.
     length : float
         Fraction of the Newton step taken; 0 if no step lowered the objective.
     mean_distance : float
@@ -138,7 +139,7 @@ class RegistrationStep:
 
 @dataclass(frozen=True)
 class SimilarityTransform:
-    """x' = scale rotation x + translation, from the template to the target."""
+    """Similarity x' = scale rotation x + translation, from the template to the target."""
 
     scale: float
     rotation: FloatArray
@@ -165,15 +166,15 @@ class RegistrationQuality:
     Attributes
     ----------
     mean_distance, max_distance : float
-        Surface vertices to the target [m].
+        Distances of surface vertices to the target [m].
     reverse_mean_distance, reverse_max_distance : float
-        Target samples to the registered faces [m].
+        Distances of target samples to the registered faces [m].
     least_jacobian : float
         Smallest volume of a tetrahedron over its aligned one.
     distortion : float
         W, 0 for a similarity.
     shape : MeshQuality
-        MeshQuality of the registered mesh.
+        Quality of the registered mesh.
     """
 
     mean_distance: float
@@ -195,12 +196,12 @@ class Registration:
     mesh : TetMesh
         The template's tetrahedra with moved vertices.
     alignment : SimilarityTransform
-        SimilarityTransform from which the elastic registration started.
+        Similarity from which the elastic registration started.
     quality : RegistrationQuality
     history : tuple[RegistrationStep, ...]
         One entry per step.
     converged : bool
-        Whether the alignment converged and the tolerance was met; if not, the last stage was still
+        Whether the alignment converged and the tolerance was met. If not, the result is still
         within the larger distances of the rule.
     """
 
@@ -233,8 +234,8 @@ def register(
     Raises
     ------
     RegistrationError
-        If the target is not an organ of the template's kind: its size differs too much, or its
-        surface cannot be reached without flattening tetrahedra.
+        If the target is not an organ of the template's kind: its size differs too much, or
+        tetrahedra would flatten before its surface is reached.
     """
     rule = rule or RegistrationRule()
     target = sample_target(surface, 3 * rule.n_samples)
@@ -277,7 +278,7 @@ def _require_close(reached: RegistrationQuality, name: str, rule: RegistrationRu
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """The problem that each step of the continuation works on."""
+    """Problem of each step of the continuation."""
 
     distortion: Distortion
     mesh: TetMesh
@@ -314,12 +315,15 @@ class _Fit:
 
     @cached_property
     def _analysis(self) -> rslab.LdltSymbolic:
-        """Of the pattern that all Hessians share."""
+        """Symbolic factorization of the common pattern of all Hessians."""
         pattern = self.distortion.matrix(np.ones(self.distortion.n_entries))
         return rslab.analyze(pattern, path="ldlt", threads=1)
 
     def _tangential(self, stiffness: float) -> float:
-        """Falls from the rule's value in the first stage to 0 in the last, in the logarithm."""
+        """Return the tangential stiffness, which falls in the logarithm of the stage's stiffness.
+
+        It is the rule's value in the first stage and 0 in the last.
+        """
         rule = self.rule
         passed = np.log(stiffness / rule.first_stiffness)
         return rule.tangential * (
@@ -363,11 +367,12 @@ def measure(
 def align_upright(
     mesh: TetMesh, target: Target, rule: RegistrationRule, iterations: int = 60
 ) -> tuple[SimilarityTransform, bool]:
-    """Similarity from the template to the target near the axes of both, and whether it converged.
+    """Return the similarity from template to target near the axes of both, and if it converged.
 
-    Gauss-Newton on the squared distances of both surfaces, from matched volume and centroid, plus
-    |rotation|^2 / rotation_spread^2. Without that prior, the closest fit of two roundish organs can
-    lie 65 degrees off, and maps one anatomical region to another. 42 livers took 3 to 8 steps.
+    Gauss-Newton minimises the squared distances of both surfaces, from matched volume and centroid,
+    plus |rotation|^2 / rotation_spread^2. Without that prior, the closest fit of two roundish
+    organs can lie 65 degrees off, and maps one anatomical region to another. The alignment of 42
+    livers took 3 to 8 steps.
 
     Raises
     ------

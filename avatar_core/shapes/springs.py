@@ -1,7 +1,7 @@
 """Springs between the surfaces of a template and a target, from each point to the nearest.
 
-The nearest point minimises |x - y|^2 + length^2 |n_x - n_y|^2 over position and normal, which keeps
-the two faces of a thin lobe apart; without a length, it is the closest point.
+The nearest point minimises |x - y|^2 + length^2 |n_x - n_y|^2 over position and normal. The
+normal's term keeps the two faces of a thin lobe apart. Without a length, it is the closest point.
 """
 
 from __future__ import annotations
@@ -32,8 +32,10 @@ class Target:
     Attributes
     ----------
     surface : SurfaceMesh
-    points, normals : ndarray, shape (n, 3)
-        Points and normals [m]; normals point outward, by the winding number.
+    points : ndarray, shape (n, 3)
+        Samples [m].
+    normals : ndarray, shape (n, 3)
+        Unit normals, outward by the winding number.
     volume : float
         Enclosed volume [m^3].
     center : ndarray, shape (3,)
@@ -119,11 +121,15 @@ class Springs:
     Attributes
     ----------
     nodes : ndarray of int, shape (m, 3)
+        Vertices of the template's face.
     barycentric : ndarray, shape (m, 3)
-    anchors, normals : ndarray, shape (m, 3)
-        Anchors and normals [m].
+        Coordinates of the point in the face.
+    anchors : ndarray, shape (m, 3)
+        Anchors on the target [m].
+    normals : ndarray, shape (m, 3)
+        Unit normals at the anchors.
     weights : ndarray, shape (m,)
-        Stiffness of each spring ; those from each surface sum to one.
+        Stiffness of each spring; the springs from each surface sum to one.
     """
 
     nodes: IntArray
@@ -137,7 +143,7 @@ class Springs:
         return np.einsum("ik,ikd->id", self.barycentric, positions[self.nodes])
 
     def straightened(self, positions: FloatArray, reach: float) -> Springs:
-        """Return the same, but those longer than ``reach`` [m] pull along their gap."""
+        """Return the same springs, where those longer than ``reach`` [m] pull along their gap."""
         gap = self.anchors - self.points(positions)
         length = np.linalg.norm(gap, axis=1)
         far = length > reach
@@ -146,7 +152,7 @@ class Springs:
         return replace(self, normals=normals)
 
     def system(self, n_vertices: int, tangential: float) -> tuple[sp.csr_matrix, FloatArray]:
-        """A and b with |A x - b|^2 = sum w (gap . n)^2 + tangential w |gap - (gap . n) n|^2."""
+        """Return A, b with |A x - b|^2 = sum w (gap . n)^2 + tangential w |gap - (gap . n) n|^2."""
         across = self.normals[:, :, None] * self.normals[:, None, :]
         pull = across + np.sqrt(tangential) * (np.eye(3) - across)
         pull *= np.sqrt(self.weights)[:, None, None]
@@ -163,13 +169,17 @@ class Springs:
 def surface_springs(
     positions: FloatArray, mesh: TetMesh, target: Target, normal_length: float | None
 ) -> Springs:
-    """Springs from the template's surface vertices to the target, and from every third sample back.
+    """Return springs from the template's vertices to the target, and back from every third sample.
 
     Parameters
     ----------
-    positions : ndarray, shape (n_vertices, 3) [m], current positions of the template's vertices
-    normal_length : weight of the normals in the distance [m]; None connects the vertices to the
-        closest point of the target's triangles, whatever its normal
+    positions : ndarray, shape (n_vertices, 3)
+        Current positions of the template's vertices [m].
+    mesh : TetMesh
+    target : Target
+    normal_length : float or None
+        Weight of the normals in the distance [m]. None connects the vertices to the closest point
+        of the target's triangles, whatever its normal.
     """
     faces, own = mesh.boundary_faces, mesh.surface_vertices
     face_normals = _area_normals(positions, faces)

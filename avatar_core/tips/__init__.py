@@ -1,5 +1,4 @@
-"""Tips in tissue: the law of their contact, for their shape and that of the surface, and the dent
-that they show.
+"""Tips in tissue: their contact law, for the shapes of tip and surface, and the displayed dent.
 
-Nothing here knows an organ but by its distance, its modulus and its compliance for a patch.
+This room knows an organ only by its distance, its modulus and its compliance for a patch.
 """

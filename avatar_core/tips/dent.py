@@ -1,39 +1,40 @@
-"""The dent that is shown near a tip: that of its contact, in the place of the patch's.
+"""The displayed dent near a tip: the contact's dent in place of the patch's.
 
-A vademecum's cloud shows the organ under a smooth patch of radius R_p. Near a tip that presses with
-the elastic force F over a contact radius a (:mod:`avatar_core.tips.law`), the field
-of the patch on a half-space is taken off and that of the contact put in its place,
+A vademecum's cloud displays the organ under a smooth patch of radius R_p. A tip presses with the
+elastic force F over a contact radius a (:mod:`avatar_core.tips.law`). Near it, the field of the
+patch on a half-space is replaced by the field of the contact,
 
-    u(x) -= n h(rho) [u_tip(rho) - u_patch(rho)],      rho = |x - s|,   rho < 2 R_p,
+    u(x) -= n h(rho) [u_tip(rho) - u_patch(rho)],      rho = |x - s|,   rho < 2 R_p.
 
-x being a point at rest, s the surface point under the tip and n the normal there. By the Method of
+x is a point at rest, s the surface point under the tip and n the normal there. By the Method of
 Dimensionality Reduction (Popov & Hess, 2015, Sec. 3.2) both normal displacements of the surface are
 
     u(rho) = 2 / pi  int_0^min(rho, a)  w(x) / sqrt(rho^2 - x^2) dx,
     w_tip(x) = delta - g(x),                                                             x < a,
     w_patch(x) = 16 / (5 pi) F / (E* R_p) (1 - x^2 / R_p^2)^(5/2),                       x < R_p.
 
-Where the tip touches a plane, that is u_tip = delta - f(rho). On any other surface a point that
-lies b below the plane through s, or above it with b < 0, is kept out of the tip,
+Where the tip touches a plane, u_tip = delta - f(rho). On any other surface, let b be the depth of a
+point below the plane through s. A point above the plane, b < 0, is kept out of the tip,
 
     u_tip = delta - f(rho) + max(0, -b),                                               rho < a.
 
-Beside it u_tip is a Gauss rule in theta, s = s_a sin(theta) being the parameter of the tip's table,
-which misses the integral by less than 0.1 % of delta; by 0.4 % at the very rim of a punch, and by
-up to 2 % in touches of some hundredths of a millimetre. Of the patch there is a table, scaled so
-that its mean under the patch's own pressure is c F, what the force law takes off.
-Far off both are F / (pi E* rho). What is left of their difference at two patch radii, 0.4 % of the
-dent for contacts of up to 10 mm and 9 % for 20 mm, fades by the factor h from 1.5 patch radii on,
-once continuously differentiable; farther off nothing is touched.
+Beside the contact, u_tip is a Gauss rule in theta, with s = s_a sin(theta) the parameter of the
+tip's table. The rule misses the integral by less than 0.1 % of delta. At the very rim of a punch it
+misses 0.4 %, in touches of some hundredths of a millimetre up to 2 %. The patch has a table, scaled
+so that its mean under the patch's own pressure is c F, the amount that the force law takes off. Far
+off both are F / (pi E* rho). Their difference at two patch radii is 0.4 % of the dent for contacts
+of up to 10 mm and 9 % for 20 mm. It fades by the factor h from 1.5 patch radii on, once
+continuously differentiable; farther off nothing changes.
 
-Below the surface the same function is taken at the distance rho from s: exact at the surface, and
-falling with the depth as 1 / rho, as the field of Boussinesq's point force does, which is up to
-twice as large right under the force. Only the displacement along n changes. That along the surface,
-which is slight in tissue that hardly changes its volume, stays the patch's, and so does that of
-friction. In viscoelastic tissue the present dent is replaced, not the traces of earlier ones.
+Below the surface the same function is taken at the distance rho from s. It is exact at the surface
+and falls with the depth as 1 / rho, like the field of Boussinesq's point force, which is up to
+twice as large right under the force. Only the displacement along n changes. The displacement along
+the surface is slight in nearly incompressible tissue and stays the patch's; so does the
+displacement by friction. In viscoelastic tissue the present dent is replaced, not the traces of
+earlier ones.
 
-A disc of radius a that is bonded to the surface (:mod:`avatar_core.contact.effects.grasp`) moves
-with all of its force g, by L g / (2 E* a) within, and 2 / pi asin(a / rho) times that beside it.
+A bonded disc of radius a (:mod:`avatar_core.contact.effects.grasp`) moves with all of its force g,
+by L g / (2 E* a) within, and 2 / pi asin(a / rho) times that beside it.
 """
 
 from __future__ import annotations
@@ -100,8 +101,9 @@ def dent_arrays(
 def points_around(
     points: np.ndarray, centres: np.ndarray, patch_radius: float
 ) -> tuple[np.ndarray, ...]:
-    """Points that a tip near each centre may move: start (n + 1,), and their numbers, nearest
-    first.
+    """Return the points that a tip near each centre may move.
+
+    They are given by start (n + 1,) and their numbers, nearest first.
     """
     # Here, because the contact node needs none of it.
     from scipy.spatial import cKDTree
@@ -120,19 +122,19 @@ def points_around(
 def add_dents(  # type: ignore[no-untyped-def]
     model, data, start, around, rest, field, width, tip, patch
 ):
-    """Replace the dent of the patch by that of each tip in contact, in a displacement.
+    """Replace the dent of the patch by the dent of each tip in contact, in a displacement.
 
     Parameters
     ----------
     start, around
-        Start and around of points near load positions.
+        Points near load positions: first of each position, and their numbers.
     rest
-        Rest of all points [m].
+        All points at rest [m].
     field
-        Numbers of the points that are changed, ``width`` of each: 3, their displacement, or 6,
-        their position and displacement.
+        Values of the points to change, ``width`` each: 3 for displacement, 6 for position and
+        displacement.
     tip, patch
-        1 or 0, whether the dent of the tip is put in, and that of the patch taken off.
+        1 or 0, whether the dent of the tip is added, and that of the patch taken off.
     """
     if not model.law.on or not model.dent.on:
         return
@@ -147,7 +149,7 @@ def add_dents(  # type: ignore[no-untyped-def]
 def _add_dent(  # type: ignore[no-untyped-def]
     model, data, t, start, around, rest, field, width, tip, patch
 ):
-    """Of one tip. Far from all load positions, which is rare, every point is tried."""
+    """Replace the dent of one tip. Far from all load positions, which is rare, try every point."""
     delta, _, _, a = dent(model, data, t)
     far = _lay_springs(model, data, t, delta)
     s, n = data.point[t], data.normal[t]
@@ -169,7 +171,7 @@ def _add_dent(  # type: ignore[no-untyped-def]
 def _add_disc(  # type: ignore[no-untyped-def]
     model, data, t, start, around, rest, field, width, tip, patch
 ):
-    """The dent of a jaw that holds tissue, along L g."""
+    """Add the dent of a jaw that holds tissue, along L g."""
     n, g, s, value = data.normal[t], data.friction.push[t], data.point[t], data.law.value[t]
     a, reach = model.grasp.radius[t], (REACH * model.dent.patch_radius[0]) ** 2
     along, aside = g[0] * n[0] + g[1] * n[1] + g[2] * n[2], model.law.mindlin[0]
@@ -197,15 +199,16 @@ def _add_disc(  # type: ignore[no-untyped-def]
 
 @fast
 def _fading(part):  # type: ignore[no-untyped-def]
-    """Return h at the square of a distance over that of the reach."""
+    """Return h at the square of a distance over the square of the reach."""
     left = min(1.0, (1.0 - part) / (1.0 - (FADE / REACH) ** 2))
     return left * left * (3.0 - 2.0 * left)
 
 
 @fast
 def _nearest_position(model, data, t):  # type: ignore[no-untyped-def]
-    """The load position nearest to the point under a tip, of those that carry it; its distance
-    squared [m^2].
+    """Return the nearest load position that carries the point under a tip.
+
+    The second value is its squared distance [m^2].
     """
     nearest, least = 0, 1e9
     for i in range(data.n_nodes[t]):
@@ -218,10 +221,10 @@ def _nearest_position(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def _lay_springs(model, data, t, delta):  # type: ignore[no-untyped-def]
-    """x^2 and 2 / pi w(x) dx of a contact at the nodes of the rule.
+    """Write x^2 and 2 / pi w(x) dx of a contact at the nodes of the rule.
 
-    Returns the sums of the latter times 1, x^2 / 2, 3/8 x^4 and 5/16 x^6, of the series of
-    1 / sqrt(rho^2 - x^2).
+    Returns the sums of 2 / pi w(x) dx times 1, x^2 / 2, 3/8 x^4 and 5/16 x^6, for the series of 1 /
+    sqrt(rho^2 - x^2).
     """
     m0 = m1 = m2 = m3 = 0.0
     end = min(data.law.place[t], 1.0)
@@ -247,8 +250,10 @@ def _move(  # type: ignore[no-untyped-def]
 ):
     """Change the displacement of one point, if it is near enough.
 
-    under : surface point and normal, (2 R_p)^2 [m^2] and number of the tip; shares : 1 or 0, of the
-    tip's dent, and c F or 0 [m]; contact : a^2, delta, 1 / radius; far : sums of the series
+    under : surface point and normal, (2 R_p)^2 [m^2] and number of the tip
+    shares : 1 or 0 for the tip's dent, and c F or 0 [m]
+    contact : a^2, delta, 1 / radius
+    far : sums of the series
     """
     place, normal, reach, t = under
     at = rest[v]
@@ -271,7 +276,7 @@ def _move(  # type: ignore[no-untyped-def]
 
 @fast
 def _inside(contact, height, rho, below):  # type: ignore[no-untyped-def]
-    """u_tip where the tip touches [m], at a distance; points inside the organ are not below."""
+    """Return u_tip where the tip touches [m]; points inside the organ are not below the plane."""
     f = _in_table(height, 1.0 - np.sqrt(max(0.0, 1.0 - rho * contact[2])))
     aside = np.sqrt(max(0.0, rho * rho - below * below))
     return contact[1] - f + max(0.0, min(aside, -below))
@@ -279,14 +284,14 @@ def _inside(contact, height, rho, below):  # type: ignore[no-untyped-def]
 
 @fast
 def _far_off(far, square):  # type: ignore[no-untyped-def]
-    """u_tip far beside the contact [m], at the square of a distance; 1e-4 of delta are left out."""
+    """Return u_tip far beside the contact [m], by squared distance; 1e-4 of delta are left out."""
     part = np.float32(1.0) / np.float32(square)
     return np.sqrt(part) * (far[0] + part * (far[1] + part * (far[2] + part * far[3])))
 
 
 @fast
 def _outside(data, square):  # type: ignore[no-untyped-def]
-    """u_tip beside the contact [m], at the square of a distance."""
+    """Return u_tip beside the contact [m], by squared distance."""
     far, total = np.float32(square), np.float32(0.0)
     for i in range(NODES):
         total += data.dent.spring[i] / np.sqrt(far - data.dent.square[i])
@@ -295,6 +300,6 @@ def _outside(data, square):  # type: ignore[no-untyped-def]
 
 @fast
 def _in_table(table, part):  # type: ignore[no-untyped-def]
-    """Linear interpolation at ``part`` in [0, 1]."""
+    """Interpolate a table linearly at ``part`` in [0, 1]."""
     k = min(int(part * INTERVALS), INTERVALS - 1)
     return table[k] + (part * INTERVALS - k) * (table[k + 1] - table[k])

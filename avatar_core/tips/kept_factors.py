@@ -1,7 +1,7 @@
-"""Shape factors of the tips that a scene has, computed once on a machine.
+"""Shape factors of a scene's tips, computed once on a machine.
 
-A vademecum holds none: each takes a second or three, and a scene has one tip or two. What was
-computed is kept by the content it was made of, a few in memory and some in the user's cache.
+A vademecum holds no shape factors: each takes a second or three, and a scene has one tip or two.
+They are kept by the content they were made of, a few in memory and some in the user's cache.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _ARRAYS = ShapeFactor._fields
 
 
 def factors_of(field: TipField, tips: Sequence[Tip]) -> ShapeFactor:
-    """log s of each tip over the outline of a tip field; zero for patches, and without one."""
+    """Return log s of each tip over the outline of a tip field; zero for patches or no field."""
     if field.outline is None or any(tip.shape == "patch" for tip in tips):
         return of_planes(len(tips))
     made = {tip: _kept(_Made(field, tip)) for tip in tips}
@@ -38,7 +38,7 @@ def factors_of(field: TipField, tips: Sequence[Tip]) -> ShapeFactor:
 
 
 class _Made:
-    """The parts that a factor is made of; two are equal where their content is."""
+    """Parts that a factor is made of; two are equal if their content is."""
 
     def __init__(self, field: TipField, tip: Tip) -> None:
         self.field, self.tip = field, tip
@@ -79,7 +79,7 @@ def _folder() -> Path:
 
 
 def _drop_old(folder: Path) -> None:
-    """Remove what was not used for longest, where another is to be kept."""
+    """Remove the least recently used files before another is kept."""
     files = sorted(folder.glob("*.h5"), key=lambda path: path.stat().st_mtime)
     for path in files[: max(0, len(files) + 1 - _ON_DISK)]:
         path.unlink(missing_ok=True)

@@ -1,21 +1,21 @@
-"""What large strain adds to the dent of a sphere in a neo-Hookean organ.
+"""Extra depth of a sphere's dent by large strain in a neo-Hookean organ.
 
 At the force F a sphere of radius R sinks into a neo-Hookean half-space deeper than Sneddon's
-solution for small strain says, by
+solution for small strain, by
 
     eta(F) = R e(s),    s^3 = 3 F / (4 E* R^2),    e = s^3 (c_0 + c_1 s + c_2 s^2 + c_3 s^3),
 
 s^2 being Hertz's depth over R. Second-order theory adds a term of the order a / R to Hertz's depth
 a^2 / R, a being the contact radius (Giannakopoulos & Triantafyllou, J. Mech. Phys. Solids 55:1196,
-2007): therefore the series in s begins with s^3. The coefficients are fitted to our own finite
-elements (:mod:`avatar_core.fem.sphere_indentation`) up to 1.5 R, one row for each Poisson's ratio,
-with cubic splines between them. ``avatar study indentation`` computes and fits them anew and says
-what they miss. Beyond 1.5 R eta continues as its tangent. Nearly incompressible tissue gives way
-more than at small strain; of nu 0.3 or less it gives way less, and eta is negative.
+2007). The series in s therefore begins with s^3. The coefficients are fitted to our own finite
+elements (:mod:`avatar_core.fem.sphere_indentation`) up to 1.5 R. Each Poisson's ratio has one row,
+with cubic splines between rows. ``avatar study indentation`` computes and fits them anew and prints
+their error. Beyond 1.5 R eta continues as its tangent. Nearly incompressible tissue gives way more
+than at small strain. At nu of 0.3 or less it gives way less, and eta is negative.
 
-eta is a function of F / E* alone, as the dent of small strain is one of F / E* and the surface's
-shape: beside E* Phi the dent stores E* Psi, Psi = int L d eta(L) with L = F / E*, and its force
-on the tip is - Psi grad E* at constant F.
+eta is a function of F / E* alone, because the dent of small strain is a function of F / E* and the
+surface's shape. Beside E* Phi the dent stores E* Psi, Psi = int L d eta(L) with L = F / E*. Its
+force on the tip is - Psi grad E* at constant F.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ NONE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])  # small strain
 
 
 def large_dent_of(tip: Tip, poisson_ratio: float, neo_hookean: bool) -> np.ndarray:
-    """c_0 ... c_3, the s^3 where the tangent begins, and the dent's least compliance, shape (6,).
+    """Return c_0 ... c_3, the s^3 where the tangent begins, and the dent's least compliance, (6,).
 
-    The last is a part of 1 / (2 E* R), the least at small strain. Of another material, and of
-    another tip than a sphere, nothing is known: its dent is that of small strain.
+    The last is a fraction of 1 / (2 E* R), the least compliance at small strain. For another
+    material, or a tip that is no sphere, the law is unknown: the dent is that of small strain.
     """
     if not neo_hookean or tip.shape != "sphere":
         return NONE
@@ -54,7 +54,7 @@ def large_dent_of(tip: Tip, poisson_ratio: float, neo_hookean: bool) -> np.ndarr
 
 
 def interpolated(table: np.ndarray, poisson_ratio: float) -> np.ndarray:
-    """c_0 ... c_3 and the largest s^3 between the rows of a table like ``COEFFICIENTS``, (5,)."""
+    """Return c_0 ... c_3 and the largest s^3 between rows like ``COEFFICIENTS``, shape (5,)."""
     # Here, because the contact node needs none of it.
     from scipy.interpolate import CubicSpline
 
@@ -62,7 +62,7 @@ def interpolated(table: np.ndarray, poisson_ratio: float) -> np.ndarray:
 
 
 def with_least(law: np.ndarray) -> np.ndarray:
-    """With the part of the least compliance that is left, shape (6,)."""
+    """Return the law with the fraction of the least compliance appended, shape (6,)."""
     s = np.linspace(0.0, law[4] ** (1.0 / 3.0), 200)
     slope = s[:, None] ** np.arange(4) @ (law[:4] * (1.0, 4.0 / 3.0, 5.0 / 3.0, 2.0))
     return np.append(law, 1.0 + 1.5 * min(0.0, slope.min()))

@@ -1,36 +1,36 @@
 """The contact law of a tip: how deep it sinks into the tissue right under it.
 
 A vademecum knows the organ's response to a smooth patch of radius R_p, whatever the size of the
-tip. What the patch dents its own neighbourhood is that of a half-space; it is taken off, and what
-the tip dents is put in its place. With F the normal force and d the depth of the tip,
+tip. The patch dents its neighbourhood like a half-space. This dent is taken off, and the dent of
+the tip is put in its place. With F the normal force and d the depth of the tip,
 
     d = delta(F) + F [gamma - c],      c = 0.75 / (E* R_p),      E* = E / (1 - nu^2),
 
 gamma the organ's compliance for the patch and c at most gamma. On a half-space every body of
-revolution touches within a radius a where (Sneddon, Int. J. Eng. Sci. 3:47, 1965; g in
-:mod:`avatar_core.geometry.tip`)
+revolution touches within a radius a (Sneddon, Int. J. Eng. Sci. 3:47, 1965; g in
+:mod:`avatar_core.geometry.tip`) with
 
     delta = g(a),      F = 2 E* int_0^a x g'(x) dx,
 
-and from its full radius on as a punch. What the surface around the tip does to its contact
-multiplies E*, here and in what follows, but for that in c, by its shape factor
-(:mod:`avatar_core.tips.shape_factor`).
+and from its full radius on as a punch. The shape of the surface around the tip changes its contact.
+This multiplies E* by the tip's shape factor (:mod:`avatar_core.tips.shape_factor`), here and below,
+except for the E* in c.
 
 The dent stores the energy E* Phi, Phi = int_0^a (delta(a) - delta(x))^2 dx, and the force on the
 tip is the derivative of all energy: at constant F
 
     dF_tip = - Phi grad E* - F^2 / 2 grad c.
 
-Where the scene chooses large deformation, a sphere in a neo-Hookean organ sinks by eta deeper than
-delta, which may be negative (:mod:`avatar_core.tips.large_strain`),
+If the scene chooses large deformation, a sphere in a neo-Hookean organ sinks by eta deeper than
+delta. eta may be negative (:mod:`avatar_core.tips.large_strain`),
 
     eta(F) = R e(w),      w = (3 F / (4 E* R^2))^(2/3),      Psi = int_0^(F / E*) L d eta(L),
 
-w being Hertz's depth over R, e fitted to our own finite elements. It depends on the force alone and
-adds its Psi to Phi: the force stays the derivative of one energy.
+w being Hertz's depth over R, e fitted to our own finite elements. eta depends on the force alone
+and adds its Psi to Phi: the force stays the derivative of one energy.
 
-In viscoelastic tissue F is replaced by the force on an elastic organ that is dented alike (Lee &
-Radok, J. Appl. Mech. 27:438, 1960), which the tip carries along.
+In viscoelastic tissue F is replaced by the force on an elastic organ with the same dent (Lee &
+Radok, J. Appl. Mech. 27:438, 1960), which is part of the tip's state.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ LAW_STATE = kind(
 
 
 def of_planes(n_tips: int) -> ShapeFactor:
-    """Return zero everywhere: one brick that is none."""
+    """Return zero log s for all tips, in one empty brick."""
     value = np.zeros((n_tips, 0, BRICK, BRICK, BRICK), np.float32)
     return ShapeFactor(np.full((1, 1, 1), -1, np.int32), value, np.array([_EVERYWHERE]))
 
@@ -111,14 +111,15 @@ def law_arrays(
 
     Parameters
     ----------
+    tips : Sequence[Tip]
     material : Material
         Material of the organ.
-    local : ndarray
-        float32, shape (2, nx, ny, nz), E* and c.
+    local : ndarray of float32, shape (2, nx, ny, nz)
+        E* and c.
     shape : ShapeFactor or None
-        Shape of each tip; None for a plane.
+        Shape factor of each tip; None for a plane.
     error_factor : float
-        Error factor on the law's error.
+        Factor on the law's error.
     neo_hookean : bool
         Whether the dents of spheres are those of large strain.
 
@@ -165,8 +166,10 @@ def sample_law(model, data, t, tip):  # type: ignore[no-untyped-def]
 
 @fast
 def _at_place(model, data, t):  # type: ignore[no-untyped-def]
-    """Weights of cubic Hermite interpolation and both ends of the table's interval at ``place``,
-    the place within it, and the depth beyond the tip's full radius.
+    """Return the weights of cubic Hermite interpolation and the table's interval at ``place``.
+
+    The values are the weights, both ends of the interval, the place within it, and the depth beyond
+    the tip's full radius.
     """
     s = data.law.place[t]
     i = min(int(min(s, 1.0) * INTERVALS), INTERVALS - 1)
@@ -189,7 +192,7 @@ def _at_place(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def _hermite(weights, p, q, p_slope, q_slope):  # type: ignore[no-untyped-def]
-    """Between two ends p and q, by their slopes."""
+    """Interpolate between two ends p and q, by their slopes."""
     return weights[0] * p + weights[1] * q + weights[2] * p_slope + weights[3] * q_slope
 
 
@@ -206,7 +209,7 @@ def dent(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def stored_energy(model, data, t):  # type: ignore[no-untyped-def]
-    """Phi [m^3] at ``place``."""
+    """Return Phi [m^3] at ``place``."""
     w, p, q, _, wall = _at_place(model, data, t)
     a = _hermite(w, p[0], q[0], p[1], q[1])
     first = _hermite(w, p[4], q[4], p[0] * p[3], q[0] * q[3])
@@ -216,10 +219,10 @@ def stored_energy(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def tangential_compliance(model, data, t):  # type: ignore[no-untyped-def]
-    """Compliance of the dent for a tangential force, less that of the patch [m/N].
+    """Return the dent's compliance for a tangential force, less the patch's [m/N].
 
-    rho / (2 E* a) with rho = (2 - nu) / (2 (1 - nu)), 1 / (8 G a) of Mindlin (J. Appl. Mech.
-    16:259, 1949) for a contact that sticks everywhere; the patch's is rho c.
+    It is rho / (2 E* a) with rho = (2 - nu) / (2 (1 - nu)), the 1 / (8 G a) of Mindlin (J. Appl.
+    Mech. 16:259, 1949) for a contact that sticks everywhere. The patch's is rho c.
     """
     _, _, _, a = dent(model, data, t)
     a = max(a, LEAST_CONTACT * model.law.radius[t])
@@ -230,9 +233,11 @@ def tangential_compliance(model, data, t):  # type: ignore[no-untyped-def]
 
 @inlined
 def law_error(model, data, t):  # type: ignore[no-untyped-def]
-    """Relative error of the force by the law alone: over tumours, where the surface is no plane,
-    where the gap grows by another length than the tip moves (by as much, the force is not that of
-    its load), and where the organ is not as soft at the tip's lowest point as at the surface.
+    """Return the relative error of the force by the law alone.
+
+    Errors arise over tumours, where the surface is no plane, and where the organ is less soft at
+    the tip's lowest point than at the surface. They also arise where the gap grows by another
+    length than the tip moves: the force is then not that of its load.
     """
     law = data.law
     plain = law.value[t, STIFFNESS] * np.exp(-law.shape[t])

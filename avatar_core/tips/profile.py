@@ -1,4 +1,4 @@
-"""The table of a tip's profile: depth, load and energy of its dent over the contact radius.
+"""Table of a tip's profile: depth, load and energy of its dent over the contact radius.
 
 On a flat half-space, in the notation of :mod:`avatar_core.tips.law`,
 

@@ -1,20 +1,20 @@
-"""How much stiffer a tip finds the surface around it than a plane.
+"""Shape factor: stiffness of the surface around a tip relative to a plane.
 
-The contact law (:mod:`avatar_core.tips.law`) is that of a plane. A tip at p, d deep
-and d' = (1 - ``RETREAT``) d once the organ has given way, meets bulges, facets, folds and edges as
-they are: on an elastic half-space with the surface that was read, it feels the load F_0
-(:mod:`avatar_core.fem.half_space_contact`), on a plane F_1. The law's modulus is multiplied by the
-shape factor
+The contact law (:mod:`avatar_core.tips.law`) is that of a plane. A tip at p is d deep, and d' = (1
+- ``RETREAT``) d once the organ has given way. It meets bulges, facets, folds and edges. An elastic
+half-space with the surface that was read gives the load F_0
+(:mod:`avatar_core.fem.half_space_contact`), a plane gives F_1. The law's modulus is multiplied by
+the shape factor
 
     s(p) = F_0(p) / F_1(d').
 
-Over a surface of one curvature s depends on p alone and hardly on the depth: for small contacts of
+Over a surface of one curvature s depends on p alone and hardly on the depth. For small contacts of
 a ball of radius R on one of radius R_o it is (1 + R / R_o)^(-1/2), Hertz's. The force on the tip is
-the derivative of the stored energy; that it does not change with the depth makes that force the
-load on the organ as well.
+the derivative of the stored energy. Because s does not change with the depth, this force is also
+the load on the organ.
 
-log s is held by splines of ``SPACING``. It is found for a tip at depths of ``PRESSED``, and held
-above and below.
+log s is stored by splines of ``SPACING``. It is computed for a tip at depths of ``PRESSED``, and
+constant above and below.
 """
 
 from __future__ import annotations
@@ -65,8 +65,9 @@ def together(factors: Sequence[ShapeFactor]) -> ShapeFactor:
 
 
 class _Plane:
-    """Load F / E* and contact radius of a tip on a plane half-space, beyond its radius too: there
-    the contact grows no more.
+    """Load F / E* and contact radius of a tip on a plane half-space.
+
+    Beyond the tip's radius the contact grows no more.
     """
 
     def __init__(self, tip: Tip) -> None:
@@ -86,9 +87,9 @@ class _Plane:
 
 
 class _Grid:
-    """The points of all bricks over a tip field, and what a tip needs to know of it.
+    """The points of all bricks over a tip field, with the distance there.
 
-    shape : of the points, whole bricks along each axis
+    shape : numbers of points, whole bricks along each axis
     distance : phi [m]
     open : where a tip may touch nearby
     """
@@ -102,7 +103,7 @@ class _Grid:
         self.open = _refined(maximum_filter(field.access, size=3), step, self.shape) > 0.0
 
     def pressed(self, offsets: OffsetGrid) -> tuple[np.ndarray, np.ndarray]:
-        """Points (n, 3) of the grid where the tip presses on the surface, and log s there (n,)."""
+        """Return grid points (n, 3) where the tip presses on the surface, and log s there (n,)."""
         first, last = PRESSED
         points, depth, normal = self._within(first - _BEYOND, last + _BEYOND)
         at = self._positions(points)
@@ -129,7 +130,7 @@ class _Grid:
         return self.tip.height(window[:, None] * ring_radii()) - depth[:, None], window
 
     def splines(self, points: np.ndarray, factor: np.ndarray) -> np.ndarray:
-        """Return coefficients of log s, known at some points of the grid, held above and below."""
+        """Return coefficients of log s, known at some grid points, constant above and below."""
         values, known = np.zeros(self.shape), np.zeros(self.shape)
         values[tuple(points.T)], known[tuple(points.T)] = factor, 1.0
         (first, last), above = PRESSED, ABOVE * SPACING
@@ -148,7 +149,7 @@ class _Grid:
         return np.asarray(self.field.origin + SPACING * points)
 
     def _within(self, least: float, most: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points of the grid (n, 3) where the tip is so deep, depths (n,) and normals (n, 3)."""
+        """Return grid points (n, 3) where the tip's depth is in a range, depths and normals."""
         depth = self.tip.offset - self.distance
         points = np.argwhere(self.open & (depth > least) & (depth < most))
         at = self._positions(points)
@@ -168,7 +169,7 @@ def _between_circles() -> np.ndarray:
 
 
 def _refined(values: np.ndarray, step: float, shape: np.ndarray) -> np.ndarray:
-    """Return the splines at points of the same origin that lie ``step`` of their spacings apart."""
+    """Return the splines at points of the same origin, ``step`` of their spacings apart."""
     for axis in range(3):
         place = step * np.arange(shape[axis])
         middle = np.floor(place + 0.5).astype(int)
@@ -183,7 +184,7 @@ def _refined(values: np.ndarray, step: float, shape: np.ndarray) -> np.ndarray:
 
 
 def _in_bricks(values: Sequence[np.ndarray]) -> ShapeFactor:
-    """Return the fields of one shape in the bricks in which any of them does not vanish."""
+    """Return the fields of one shape in the bricks where any of them is not zero."""
     blocks = [_blocks(v) for v in values]
     used = np.max([np.abs(b).max(axis=(3, 4, 5)) for b in blocks], axis=0) > _LEAST
     brick = np.full(used.shape, -1, np.int32)
