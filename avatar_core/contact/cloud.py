@@ -1,8 +1,8 @@
 """The displacement of a cloud of points, laid out for the compiled step.
 
 A cloud takes the first blocks of a vademecum's field (:mod:`avatar_core.reduction.block_field`):
-those that hold what is displayed, or all. The modes and their rounding concern the display alone:
-the force comes from the contact compliance, which keeps all its modes in single precision.
+the blocks that hold displayed vertices, or all. The modes and their rounding concern the display
+alone. The force comes from the contact compliance, which keeps all its modes in single precision.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class CloudArrays(NamedTuple):
     vertex : ndarray
         Vertex of the mesh, in each place of the blocks; -1 where a block is not full.
     large_start : ndarray
-        As ``region_start``, of the modes of large deformation, which come last.
+        Like ``region_start``, for the modes of large deformation, which come last.
     """
 
     space: np.ndarray
@@ -42,7 +42,7 @@ class CloudArrays(NamedTuple):
 def cloud_arrays(
     vademecum: Vademecum, cloud: Cloud, large: BlockField | None = None
 ) -> CloudArrays:
-    """Return the blocks of a cloud, of the vademecum's field and of what large deformation adds."""
+    """Return the blocks of a cloud from the vademecum's field and large deformation's field."""
     field, n_blocks = vademecum.field, shown_blocks(vademecum, cloud)
     parts, start = [_first_blocks(field, n_blocks)], np.cumsum(field.count, dtype=np.int64)
     large_start = np.full_like(start, start[-1])
@@ -55,7 +55,7 @@ def cloud_arrays(
 
 
 def shown_vertices(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:
-    """Return vertices of the mesh that a cloud shows, or that carry what it shows, ascending."""
+    """Return mesh vertices that a cloud shows or interpolates from, ascending."""
     # Here, because the contact node needs none of it.
     from avatar_core.vademecum.display import displayed_vertices
 
@@ -67,7 +67,7 @@ def shown_vertices(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:
 
 
 def shown_blocks(vademecum: Vademecum, cloud: Cloud) -> int:
-    """Return the blocks that hold these."""
+    """Return the number of blocks that hold these vertices."""
     return vademecum.blocks.that_hold(shown_vertices(vademecum, cloud))
 
 
@@ -86,7 +86,7 @@ def _first_blocks(field: BlockField, n_blocks: int) -> _Part:
 
 
 def _joined(parts: list[_Part]) -> _Part:
-    """Return the blocks of all fields; of all but the first, those of global modes are left out."""
+    """Return the blocks of all fields; global modes are taken from the first field only."""
     if len(parts) == 1:
         space, core, level, start = parts[0]
         return space, np.ascontiguousarray(core), level, np.ascontiguousarray(start)

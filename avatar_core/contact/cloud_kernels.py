@@ -1,17 +1,16 @@
-"""The compiled part of the contact step that deforms the cloud.
+"""Compiled kernels of the contact step that deform the cloud.
 
     u(x) = sum_r sum_k Z_rbk(x) sum_m C_rbkm a_rm,    x in block b of the cloud,
     a_rm = - sum_t lambda_t sum_j w_j W_m(s_j) . n_t,
 
-over the load positions j of region r that carry a tip, with the modes Z and the core C of
-:mod:`avatar_core.reduction.block_field`, and for large deformation the terms of
-:mod:`avatar_core.vademecum.large_deformation`. The global modes are part of every region's field;
-what they move by more than the loads that are shown (vibration, weight, faded history) stands
-apart, as a part of its own. That is an organ under patches; near a tip,
-:mod:`avatar_core.tips.dent` shows the tip's dent.
+over the load positions j of region r that carry a tip. The modes Z and the core C are those of
+:mod:`avatar_core.reduction.block_field`; large deformation adds the terms of
+:mod:`avatar_core.vademecum.large_deformation`. The global modes are part of every region's field.
+Their motion beyond the displayed loads (vibration, weight, faded history) is a part of its own.
+This is the organ under patches; near a tip, :mod:`avatar_core.tips.dent` displays the tip's dent.
 
-A step reads the modes of the regions that are *touched*: those of the load positions that carry a
-tip or hold a history of loads.
+A step reads the modes of the *touched* regions: those whose load positions carry a tip or hold a
+history of loads.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ MAX_PAST = 4  # regions whose history of loads is shown
 
 @fast
 def deform(model, data):  # type: ignore[no-untyped-def]
-    """The cloud under the forces of a period."""
+    """Deform the cloud by the forces of a period."""
     _displace(model, data)
     write_cloud(model, data)
     shift_cloud(model, data)
@@ -42,7 +41,7 @@ def deform(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def _displace(model, data):  # type: ignore[no-untyped-def]
-    """The displacement of all points into ``data.field``."""
+    """Write the displacement of all points to ``data.field``."""
     if not model.moving[0] and data.out.n_contacts[0] == 0:
         data.field[:] = np.float32(0.0)
         return
@@ -58,7 +57,7 @@ def _displace(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def _move_globals(model, data):  # type: ignore[no-untyped-def]
-    """Amplitudes that the effects give to the global modes, less those of the touched regions."""
+    """Set the amplitudes that effects give the global modes, less those of the touched regions."""
     if not model.moving[0]:
         return
     for k in range(model.region_start[0]):
@@ -91,7 +90,7 @@ def _touch(model, data, r):  # type: ignore[no-untyped-def]
 
 @fast
 def _add_load(model, data, j, x, y, z):  # type: ignore[no-untyped-def]
-    """Amplitudes of a region by a force at one of its load positions."""
+    """Add the amplitudes of a region by a force at one of its load positions."""
     first, end = model.region_start[model.region[j]], model.region_start[model.region[j] + 1]
     amplitude, load = data.amplitude[first:end], model.regional_load[j]
     f0, f1, f2 = np.float32(x), np.float32(y), np.float32(z)
@@ -101,9 +100,10 @@ def _add_load(model, data, j, x, y, z):  # type: ignore[no-untyped-def]
 
 @fast
 def _load_regions(model, data, t):  # type: ignore[no-untyped-def]
-    """The force of a tip on the regions of the load positions that carry it.
+    """Add the force of a tip to the regions of the load positions that carry it.
 
-    A region fades out before the tip leaves it, so that few are read; the others take its part.
+    A region fades out before the tip leaves it, so that few regions are read; the others take over
+    its part of the force.
     """
     region_weight, kept = data.region_weight, 0.0
     for i in range(data.n_nodes[t]):
@@ -130,14 +130,14 @@ def _load_regions(model, data, t):  # type: ignore[no-untyped-def]
 
 @inlined
 def _kept_weight(model, data, t, i):  # type: ignore[no-untyped-def]
-    """Weight of a load position, less what its region as a whole has faded."""
+    """Return the weight of a load position, reduced as its region fades."""
     whole = data.region_weight[model.region[data.nodes[t, i]]]
     return data.weight[t, i, 0] * soft_threshold(whole) / whole if whole != 0.0 else 0.0
 
 
 @inlined
 def soft_threshold(w):  # type: ignore[no-untyped-def]
-    """Soft thresholding, so that the modes of a region vanish continuously."""
+    """Return a weight after soft thresholding, so that modes of a region vanish continuously."""
     if w > 0.0:
         return max(w - LEAST_WEIGHT, 0.0)
     return min(w + LEAST_WEIGHT, 0.0)
@@ -145,7 +145,7 @@ def soft_threshold(w):  # type: ignore[no-untyped-def]
 
 @fast
 def _load_past(model, data):  # type: ignore[no-untyped-def]
-    """The load history on its regions; the weakest loads fade out, and so do weak regions."""
+    """Add the load history to its regions; the weakest loads fade out, and so do weak regions."""
     past = data.viscoelasticity
     least = least_shown(data)
     for m in range(past.count[0]):
@@ -161,7 +161,7 @@ def _load_past(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def _fade_regions(model, data):  # type: ignore[no-untyped-def]
-    """Keep the ``MAX_PAST`` regions whose own modes move most, less what the next one moves."""
+    """Keep the ``MAX_PAST`` regions whose own modes move most; subtract the next one's motion."""
     norm, n, n_global = data.region_weight, data.n_touched[0], model.region_start[0]
     for i in range(n):
         r = data.touched[i]
@@ -192,7 +192,7 @@ def _fade_regions(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def _sum_modes(model, data):  # type: ignore[no-untyped-def]
-    """The displacement of every block: of global modes that stand apart, and of touched regions."""
+    """Sum the displacement of every block: global modes apart, and touched regions."""
     amplitude, start, shown = data.amplitude, model.region_start, data.shown[0]
     space, core, level, rows = model.space, model.core, model.level, model.block_start
     n_global, n_regions = start[0], start.shape[0] - 1
@@ -214,7 +214,7 @@ def _sum_modes(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def add_part(space, core, level, rows, amplitude, shown, b, u):  # type: ignore[no-untyped-def]
-    """Add what a part of the modes, up to a level, moves in a block; four modes at a time."""
+    """Add the displacement of a block by a part's modes, up to a level; four modes at a time."""
     first, end = rows[b], rows[b + 1]
     while end > first and level[end - 1] > shown:
         end -= 1
@@ -241,7 +241,7 @@ def add_part(space, core, level, rows, amplitude, shown, b, u):  # type: ignore[
 
 @entry
 def add_to_field(space, core, level, rows, amplitude, shown, field):  # type: ignore[no-untyped-def]
-    """What a part of the modes moves in all blocks, for who measures the errors of a step."""
+    """Add the displacement of all blocks by a part's modes, to measure a step's errors."""
     for b in range(rows.shape[0] - 1):
         u = field[b * BLOCK : (b + 1) * BLOCK]
         add_part(space, core, level, rows, amplitude, shown, b, u)

@@ -81,7 +81,7 @@ RESUMED = ("passage", "seen", "active", "force", "before", "jaw")  # by another 
 
 
 def at_rest(model: Any) -> Any:
-    """Return the arrays of an organ at rest that no tool has touched, a tuple of DATA.
+    """Return the arrays of an untouched organ at rest, a tuple of DATA.
 
     model : a tuple of MODEL
     """
@@ -104,7 +104,7 @@ def at_rest(model: Any) -> Any:
 
 
 def begin(model: Any, data: Any) -> None:
-    """Let each effect set what is not its first value."""
+    """Let each effect set the arrays that do not start at their first value."""
     for name, effect in EFFECTS.items():
         if effect.State is not None and getattr(data, name) is not None:
             effect.begin(model, getattr(data, name))

@@ -1,13 +1,13 @@
-"""The compiled step's part for what is displayed in the place of the mesh's own vertices.
+"""Compiled kernels for displayed vertices that are not the mesh's own.
 
-A displayed vertex x hangs on four vertices x_i of the mesh
+A displayed vertex x is interpolated from four vertices x_i of the mesh
 (:mod:`avatar_core.vademecum.display`). Near a tip the field of a patch bends within a triangle, but
-is known there (:mod:`avatar_core.tips.dent`): with p its displacement on a half-space, faded by
-h, and u_tip that of the tip, along the inward normal,
+is known there (:mod:`avatar_core.tips.dent`). Along the inward normal, p is its displacement on a
+half-space, faded by h, and u_tip that of the tip:
 
     u(x) = sum_i w_i [u(x_i) + n h p(x_i)]  -  n h u_tip(x),
 
-so that only what is smooth is interpolated.
+so that only smooth fields are interpolated.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def display_arrays(
 ) -> Any:
     """Return the corners and weights of the displayed vertices, a tuple of DISPLAY.
 
-    vertex : of the mesh, in each place of the blocks; -1 where a block is not full
-    place : of each vertex in the blocks
+    vertex : mesh vertex in each place of the blocks; -1 where a block is not full
+    place : place of each vertex in the blocks
     vertices : ndarray, shape (n_vertices, 3), of the mesh [m]
     positions : ndarray, shape (n_positions, 3), of the patches [m]
     """
@@ -61,8 +61,9 @@ def display_arrays(
 
 @fast
 def write_cloud(model, data):  # type: ignore[no-untyped-def]
-    """The cloud, from what the modes displace in ``data.field``: with the dents of tips, at the
-    displayed vertices if they are not the mesh's.
+    """Write the cloud from the modes' displacement in ``data.field``, with the tips' dents.
+
+    If displayed vertices are not the mesh's, the cloud holds those.
     """
     cloud, dents, shown = data.out.cloud, model.dent, model.display
     flat = cloud.reshape(6 * cloud.shape[0])
@@ -77,7 +78,7 @@ def write_cloud(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def _write(rest, place, field, cloud):  # type: ignore[no-untyped-def]
-    """Deformed position and displacement of every point (n_points, 6)."""
+    """Write deformed position and displacement of every point, (n_points, 6)."""
     for v in range(place.shape[0]):
         first = 3 * place[v]
         x, y, z = field[first], field[first + 1], field[first + 2]
@@ -87,7 +88,7 @@ def _write(rest, place, field, cloud):  # type: ignore[no-untyped-def]
 
 @fast
 def _interpolate(model, rest, field, cloud):  # type: ignore[no-untyped-def]
-    """The same of displayed vertices, from the displacement of the mesh's."""
+    """Write the cloud of displayed vertices from the displacement of the mesh's."""
     corner, weight = model.display.corner, model.display.weight
     for v in range(corner.shape[0]):
         a, b = 3 * corner[v, 0], 3 * corner[v, 1]

@@ -1,4 +1,4 @@
-"""How wrong the force on a tip is expected to be, place by place on the surface."""
+"""Map of the expected force error on a tip over the surface."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ _SHELL = 5e-3  # below and above the surface, in which the compliance is sampled
 def force_error_at(vademecum: Vademecum, points: np.ndarray) -> np.ndarray:
     """Return the relative error of the force that one contact in ten exceeds, shape (n,).
 
-    As :class:`avatar_core.vademecum.force_error.ForceError` estimates it; NaN off the accessible
+    :class:`avatar_core.vademecum.force_error.ForceError` estimates it. It is NaN off the accessible
     surface, and everywhere if the vademecum was not measured.
 
     Parameters
     ----------
+    vademecum : Vademecum
     points : ndarray, shape (n, 3)
         Points of the surface at rest [m].
     """

@@ -1,8 +1,8 @@
 """The band of the force on a tip: the forces that it exceeds with 95 and 5 % probability.
 
-How far both lie from the force at the values in use is prepared for every load position and some
-depths (:mod:`avatar_core.uncertainty.force_ratios`). A step looks it up with the weights w_j of the
-load positions that carry the tip, and between two depths by their logarithm,
+The ratio of each edge to the force at the present values is prepared for every load position and
+some depths (:mod:`avatar_core.uncertainty.force_ratios`). A step looks it up with the weights w_j
+of the load positions that carry the tip, and between two depths by their logarithm,
 
     F_edge(p) = F(p) exp( sum_j w_j(p) rho_j(ln d) ),        rho = ln (edge / F).
 """
@@ -32,9 +32,9 @@ BAND = kind(
 
 @entry
 def force_band(data, band):  # type: ignore[no-untyped-def]
-    """Both edges of the wrench of each tip, of the last solution. Real-time safe.
+    """Write both edges of the wrench of each tip, from the last solution. Real-time safe.
 
-    Beyond the prepared depths the ratios are those of the nearest.
+    Beyond the prepared depths the ratios are those of the nearest depth.
     """
     out = data.out
     first, last = band.depth[0], band.depth.shape[0] - 2
@@ -70,13 +70,14 @@ class ForceBand:
     Parameters
     ----------
     data : ContactData
-        ContactData of that loop.
-    ratio : ndarray
-        float32, shape (n_tools, n_positions, n_depths, 2), ln of the low and the high edge over the
-        force.
+        Data of that loop.
+    ratio : ndarray of float32, shape (n_tools, n_positions, n_depths, 2)
+        Logarithm of the low and the high edge over the force.
     depth : ndarray, shape (n_depths,)
-        n_depths >= 2, rising by a constant factor [m].
+        Two depths or more, rising by a constant factor [m].
 
+    Attributes
+    ----------
     edges : ndarray, shape (2, n_tools, 6)
         Force [N] and torque [N m] of both edges, low first.
     """
@@ -94,6 +95,6 @@ class ForceBand:
     def update(self) -> None:
         """Write the edges of the forces of the last solution.
 
-        Real-time safe, as :func:`avatar_core.contact.model.step`.
+        Real-time safe, like :func:`avatar_core.contact.model.step`.
         """
         self._update()

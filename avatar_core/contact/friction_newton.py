@@ -1,17 +1,17 @@
 """Frictional contact of tips close to each other, by Newton's method on the projections.
 
-How close tips divide their load depends on small differences in compliance, which Gauss-Seidel
-resolves slowly. The solution is the fixed point of all projections,
+The division of a load between close tips depends on small differences in compliance, which
+Gauss-Seidel resolves slowly. The solution is the fixed point of all projections,
 
     g_t = - n a + P_D(z),    a = max(0, lambda - w / c_n),    z = tau + (y - U)_t / c_t,
 
-with D the disc of radius mu a, c_n and c_t the tip's own compliances and w its gap, solved for all
-tips together (Alart & Curnier, CMAME 92:353, 1991). Far from the solution Newton steps may diverge:
-the step of least residual is kept. Where two tips nearly coincide, one may have to pass its whole
-load to the other, which steps from the present pushes do not find; therefore each tip alone serves
-as a start, too.
+solved for all tips together (Alart & Curnier, CMAME 92:353, 1991). D is the disc of radius mu a,
+c_n and c_t are the tip's own compliances and w its gap. Far from the solution Newton steps may
+diverge: the step of least residual is kept. If two tips nearly coincide, one may have to pass its
+whole load to the other. Steps from the present pushes do not find that solution. Therefore each tip
+alone is a start, too.
 
-The steps only propose a start: convergence is decided by the sweeps that follow.
+The steps only propose a start: the following sweeps decide on convergence.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LEAST_PIVOT = 1e-9
 
 @fast
 def patch_displacement(model, data, t):  # type: ignore[no-untyped-def]
-    """U of a tip's patch: the displacement by the present pushes and without them."""
+    """Return U of a tip's patch: the displacement by the present pushes and without them."""
     superposition = data.superposition
     u0, u1, u2 = (
         superposition.free_displacement[t, 0],
@@ -82,7 +82,7 @@ def newton_steps(model, data, start):  # type: ignore[no-untyped-def]
 
 @inlined
 def _start_from_one_tip(data, t):  # type: ignore[no-untyped-def]
-    """Push of a tip if no other is in contact and it slips."""
+    """Set the push of a tip as if no other is in contact and it slips."""
     friction = data.friction
     n, y, c = data.normal[t], friction.offset[t], friction.compliance[t, t]
     gap, stiff, along = data.gap[t], 0.0, 0.0
@@ -102,7 +102,7 @@ def _start_from_one_tip(data, t):  # type: ignore[no-untyped-def]
 
 @inlined
 def _linearise(model, data, t):  # type: ignore[no-untyped-def]
-    """A tip's rows of the Newton system; returns its squared residual [N^2]."""
+    """Write a tip's rows of the Newton system; return its squared residual [N^2]."""
     friction = data.friction
     matrix, rhs, n_tools = friction.matrix, friction.rhs, data.passage.shape[0]
     for i in range(3):
@@ -169,7 +169,7 @@ def _linearise(model, data, t):  # type: ignore[no-untyped-def]
 
 @inlined
 def _linearise_held(model, data, t):  # type: ignore[no-untyped-def]
-    """Rows and residual of a tool that holds tissue: dg_t + K sum C_ts dg_s = K (y - u), s != t."""
+    """Write rows of a tool that holds tissue: dg_t + K sum_s!=t C_ts dg_s = K (y - u)."""
     friction, k = data.friction, data.grasp.stiffness[t]
     u0, u1, u2 = patch_displacement(model, data, t)
     y, square = friction.offset[t], 0.0

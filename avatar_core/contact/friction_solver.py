@@ -1,6 +1,6 @@
 """The contact forces of all tips with friction: both parts together, tip after tip, by projection.
 
-Where tips are close to each other, sweeps hardly change how they share their load; then
+Sweeps hardly change the division of a load between tips that are close to each other. Then
 :mod:`avatar_core.contact.friction_newton` proposes where they go on.
 """
 
@@ -24,7 +24,7 @@ LEAST_ACROSS = 0.05  # part of the patch's tangential compliance that a large ti
 
 @inlined
 def solve_friction(model, data):  # type: ignore[no-untyped-def]
-    """Stick where friction can hold the tip, slip elsewhere; whether the last sweeps converged."""
+    """Stick where friction can hold the tip, slip elsewhere; return whether sweeps converged."""
     friction = data.friction
     _assemble(model, data)
     mu_s, mu_k = model.friction.coefficients[0], model.friction.coefficients[1]
@@ -63,7 +63,7 @@ def solve_friction(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def _assemble(model, data):  # type: ignore[no-untyped-def]
-    """The 3 x 3 blocks of C between all tips in contact."""
+    """Assemble the 3 x 3 blocks of C between all tips in contact."""
     superposition, friction = data.superposition, data.friction
     for t in range(data.passage.shape[0]):
         for s in range(t + 1):
@@ -102,7 +102,7 @@ def _assemble(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def _press_alone(model, data, t):  # type: ignore[no-untyped-def]
-    """The contact radius that the tip would have without friction and other tips."""
+    """Compute the contact radius that the tip would have without friction and other tips."""
     depth, kept = data.superposition.free_normal[t] - data.gap[t], data.force[t]
     own = data.compliance[t, t]
     solve_tip(model, data, t, depth, own)
@@ -111,7 +111,7 @@ def _press_alone(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def _add_tangential_dent(model, data, t):  # type: ignore[no-untyped-def]
-    """The tip's own tangential compliance in place of the patch's, at that contact radius."""
+    """Replace the patch's tangential compliance by the tip's own at that contact radius."""
     friction = data.friction
     n, c, across = data.normal[t], friction.compliance[t, t], 0.0
     for i in range(3):
@@ -129,7 +129,7 @@ def _add_tangential_dent(model, data, t):  # type: ignore[no-untyped-def]
 
 @inlined
 def _set_offset(model, data, t):  # type: ignore[no-untyped-def]
-    """Return y = c - s_a, the anchor first moved by the tool's rotation."""
+    """Set y = c - s_a, the anchor first moved by the tool's rotation."""
     friction = data.friction
     n, r, spin = data.normal[t], model.tip_offset[t], data.spin[t]
     if friction.motion[t] != NONE:
@@ -150,7 +150,7 @@ def _set_offset(model, data, t):  # type: ignore[no-untyped-def]
 
 @inlined
 def _sweep(model, data):  # type: ignore[no-untyped-def]
-    """Gauss-Seidel over the tips, normal then tangential force of each; whether it converged."""
+    """Sweep over the tips, normal then tangential force (Gauss-Seidel); return convergence."""
     for sweep in range(MAX_SWEEPS):
         if model.several_tools.on and sweep < MAX_NEWTON and sweep % PATIENCE == PATIENCE - 1:
             start = (sweep // PATIENCE) % (data.passage.shape[0] + 1)
@@ -173,7 +173,7 @@ def _sweep(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def _update_normal(model, data, t):  # type: ignore[no-untyped-def]
-    """0 <= lambda  perp  gap - n . U + h >= 0."""
+    """Update lambda by 0 <= lambda  perp  gap - n . U + h >= 0."""
     n, c = data.normal[t], data.friction.compliance[t, t]
     u0, u1, u2 = patch_displacement(model, data, t)
     gap = data.gap[t] - (n[0] * u0 + n[1] * u1 + n[2] * u2)
@@ -199,7 +199,7 @@ def _update_normal(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def _update_tangential(model, data, t):  # type: ignore[no-untyped-def]
-    """Return tau <- tau + (y - U)_t / c_t, projected to |tau| <= mu lambda."""
+    """Update tau <- tau + (y - U)_t / c_t, projected to |tau| <= mu lambda."""
     friction = data.friction
     n, c, g, y = (data.normal[t], friction.compliance[t, t], friction.push[t], friction.offset[t])
     u0, u1, u2 = patch_displacement(model, data, t)
@@ -226,7 +226,7 @@ def _update_tangential(model, data, t):  # type: ignore[no-untyped-def]
 
 @inlined
 def _sticks(data, t):  # type: ignore[no-untyped-def]
-    """Whether friction is below its limit."""
+    """Return whether friction is below its limit."""
     return tangential_force(data, t) < (1.0 - 1e-9) * data.friction.limit[t] * data.force[t]
 
 

@@ -1,7 +1,7 @@
 """The constant arrays of a step: a vademecum, tools and effects laid out flat.
 
-``vademecum -> lay_out -> MODEL``; :mod:`avatar_core.contact.model` adds the compiled step, and what
-a loop keeps.
+``vademecum -> lay_out -> MODEL``; :mod:`avatar_core.contact.model` adds the compiled step and a
+loop's data.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ MODEL = kind(
     softness=array("1"),  # added where access fades [m/N]
     superposed=array("1", np.bool_),  # whether all loads and histories add up at each tip
     moving=array("1", np.bool_),  # whether global modes move beside the loads of the moment
-    # modes of the cloud's blocks; those of each part begin at block_start: of global modes that
-    # move beside the loads, of each region, and of each region's large deformation
+    # modes of the cloud's blocks; each part begins at block_start. The parts are global modes that
+    # move beside the loads, the regions, and the regions' large deformation
     space=array(f"k {BLOCK}", np.int16),
     core=array("k m", np.float32),
     level=array("k", np.int32),
@@ -91,7 +91,7 @@ MODEL = kind(
 
 @dataclass(frozen=True)
 class Shape:
-    """Shape of the organ and the tips in a layout, whatever the organ is made of.
+    """Shape of the organ and the tips in a layout, independent of the organ's material.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class Shape:
     reach : float
         Longest distance between the two positions of a block [m].
     factor : ShapeFactor
-        Factor of each tip.
+        Shape factor of each tip.
     """
 
     carriers: TipCarriers
@@ -109,7 +109,7 @@ class Shape:
 
     @classmethod
     def of(cls, vademecum: Vademecum, tips: Sequence[Tip]) -> Shape:
-        """For several materials of an organ, or several clouds, at once."""
+        """Return the shape, for several materials of an organ, or several clouds, at once."""
         # Here, because the contact node needs none of it.
         from avatar_core.tips.kept_factors import factors_of
 
@@ -133,7 +133,7 @@ def lay_out(
 ) -> Any:
     """Return the arrays of a contact model, a tuple of MODEL.
 
-    See :func:`avatar_core.contact.model.model_of`.
+    For the other parameters see :func:`avatar_core.contact.model.model_of`.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def lay_out(
 
 
 def default_effects(vademecum: Vademecum, tips: Sequence[Tip]) -> tuple[Effect, ...]:
-    """Return effects of a scene that names none: those that the vademecum and the tools require."""
+    """Return effects of a scene that names none: those that vademecum and tools require."""
     effects: list[Effect] = []
     if vademecum.large is not None:
         effects.append(LargeDeformation())
@@ -233,8 +233,8 @@ def default_effects(vademecum: Vademecum, tips: Sequence[Tip]) -> tuple[Effect, 
 def _local(vademecum: Vademecum, self_compliance: np.ndarray) -> np.ndarray:
     """Return E* and c on the grid of the tip field, shape (2, nx, ny, nz) float32.
 
-    Over a tumour of contrast q that stores the fraction f of the energy under a tip, E* is that of
-    the organ over 1 - f + f / q.
+    A tumour of contrast q stores the fraction f of the energy under a tip. Over it, E* is the
+    organ's divided by 1 - f + f / q.
     """
     stiffness = vademecum.material.plane_strain_modulus
     radius = vademecum.surface.patch_radius
@@ -251,7 +251,7 @@ def force_error_grid(
     large: large_deformation.LargeDeformation | None,
     smoothing: np.ndarray,
 ) -> np.ndarray:
-    """Return the relative error of the force on the grid of the tip field; NaN if it is not known.
+    """Return the relative force error on the grid of the tip field; NaN if it is not known.
 
     smoothing : of :class:`avatar_core.contact.organ_response.TipResponse`, or values of it
     """

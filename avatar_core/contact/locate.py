@@ -1,7 +1,7 @@
-"""Where a tip is: its gap to the organ, the normal there, its access and the load positions.
+"""Location of a tip: its gap to the organ, the normal, its access and the load positions.
 
-A tip that came in through the surface is in contact until it is outside again; how far it may have
-moved since its last pose, and how deep it may be, is bounded.
+A tip that came in through the surface is in contact until it is outside again. Its motion since its
+last pose, and its depth, are bounded.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FULL_ACCESS = 0.99  # below, the force fades
 
 @inlined
 def locate(model, data, t, tip):  # type: ignore[no-untyped-def]
-    """Gap, normal, access, compliance, surface point and load positions of a tip in contact."""
+    """Compute gap, normal, access, compliance, surface point and load positions of a tip."""
     before, continuous = data.passage[t], _is_continuous(data, t, tip)
     data.active[t] = False
     data.access[t] = 1.0
@@ -66,9 +66,9 @@ def locate(model, data, t, tip):  # type: ignore[no-untyped-def]
 
 @inlined
 def _is_continuous(data, t, tip):  # type: ignore[no-untyped-def]
-    """Whether the tip can have moved here from its last contact.
+    """Return whether the tip can have moved here from its last contact.
 
-    After invalid poses its motion is unknown; then no more than ``ENTRY_DEPTH`` is believed.
+    After invalid poses its motion is unknown; then no more than ``ENTRY_DEPTH`` is accepted.
     """
     square = 0.0
     for d in range(3):
@@ -79,7 +79,7 @@ def _is_continuous(data, t, tip):  # type: ignore[no-untyped-def]
 
 @inlined
 def _set_normal(data, t, p, phi):  # type: ignore[no-untyped-def]
-    """Return n = g / |g| with g = grad phi, and s = p - phi n."""
+    """Set n = g / |g| with g = grad phi, and s = p - phi n."""
     g = data.slope[t]
     data.steepness[t] = max(np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2), 1e-3)
     for d in range(3):

@@ -40,7 +40,10 @@ class _Compiled(NamedTuple):
 
 @cache
 def compiled_step() -> _Compiled:
-    """One for all models; it takes most of a minute, and lies in a cache on disk from then on."""
+    """Return the step compiled once for all models.
+
+    Compilation takes most of a minute; the result is then cached on disk.
+    """
     types = TableType(MODEL), TableType(DATA)
     return _Compiled(
         compiled_for(kernels.contact_solve, *types),
@@ -50,7 +53,7 @@ def compiled_step() -> _Compiled:
 
 
 def compiled_for(kernel: Any, *types: Any) -> Any:
-    """Return a kernel compiled for numba types, called without numba's look-up of these."""
+    """Return a kernel compiled for numba types, called without numba's look-up of types."""
     kernel.compile(types)
     return kernel.get_overload(types)
 
@@ -162,10 +165,11 @@ def model_of(
     ----------
     vademecum : Vademecum
     tips : Sequence[Tip]
-        The tip of each tool.
+        Tip of each tool.
     modes : int or None
         Modes of the *displacement*, as in :class:`avatar_core.vademecum.accuracy.Detail`; None for
-        all. Fewer modes leave the force exact, since the contact compliance keeps all of its own.
+        all. The force stays exact with fewer modes, since the contact compliance keeps all of its
+        own.
     cloud : Cloud
         "surface" or "volume" vertices, or "off".
     effects : Sequence[Effect] or None
@@ -176,7 +180,7 @@ def model_of(
     Raises
     ------
     ContactError, SceneError
-        For modes or clouds out of range; for effects that the vademecum cannot serve.
+        For modes or clouds out of range; for effects that the vademecum does not support.
     """
     detail = Detail(vademecum.n_modes if modes is None else modes, cloud)
     return ContactModel(lay_out(vademecum, tips, detail, effects, period))
@@ -223,7 +227,7 @@ def solve(
     orientations: np.ndarray | None = None,
     jaws: np.ndarray | None = None,
 ) -> int:
-    """The first half of :func:`step`: forces and contacts. Real-time safe, as :func:`step`."""
+    """Compute forces and contacts: the first half of :func:`step`. Real-time safe."""
     state = data.state
     state.tip[:] = tips
     if data.turns:
@@ -234,15 +238,15 @@ def solve(
 
 
 def deform(model: ContactModel, data: ContactData) -> None:
-    """The second half of :func:`step`: the cloud. Real-time safe, as :func:`step`."""
+    """Compute the cloud: the second half of :func:`step`. Real-time safe."""
     model.compiled.deform(model.table, data.table)
 
 
 def estimate_error(model: ContactModel, data: ContactData) -> None:
-    """Expected error of the forces of the last step, into ``out.force_error`` [N].
+    """Write the expected error of the last step's forces to ``out.force_error`` [N].
 
-    Exceeded by one contact in ten; see :mod:`avatar_core.vademecum.force_error`. NaN where the
-    vademecum was not measured. Real-time safe, as :func:`step`; separate, so that it can follow
+    One contact in ten exceeds it; see :mod:`avatar_core.vademecum.force_error`. It is NaN where the
+    vademecum was not measured. Real-time safe, like :func:`step`; separate, so that it can follow
     the sending of the forces.
     """
     model.compiled.error(model.table, data.table)

@@ -1,25 +1,25 @@
 """Interpolation of the response for a tip at any position: smooth weights and compliance.
 
 On the faces, the response is interpolated in s by the six-node triangles of the load positions,
-exact at each of them. A tip at p presses at the point s(p) of the faces closest to its contact,
-p - phi(p) n(p): the faces closest to p itself are others, as far above them as the centre of a
-large ball. Neither that interpolation nor s(p) is smooth: edges and folds would make the force
-jump. Weights and compliance are therefore sampled on the grid of the tip field and evaluated by the
-same B-splines B_q(p), twice differentiable almost everywhere:
+exact at each of them. A tip at p presses at the point s(p) of the faces closest to its contact, p -
+phi(p) n(p). The faces closest to p itself would differ, because the centre of a large ball lies far
+above the surface. Neither that interpolation nor s(p) is smooth: edges and folds would make the
+force jump. Weights and compliance are therefore sampled on the grid of the tip field. The same
+B-splines B_q(p) evaluate them, twice differentiable almost everywhere:
 
     w_j(p)   = sum_q B_q(p) w_j(s(x_q))         weight of load position j, sum_j w_j = 1
     gamma(p) = sum_q B_q(p) gamma_q             gamma(x_q) = [K gamma_0](x_q)
                                                 gamma_0 = n . C(s, s) n at s = s(x_q)
 
-with n = grad phi / |grad phi| the direction of pressing, C(s, s) interpolated from both sides and
-completed by what that misses (:mod:`avatar_core.fem.patch_on_plane`), K the kernel of the tip
-field with a tenth of the patch radius, and gamma_q such that the splines take those values: a sum
-of the values themselves would blur them. gamma is the compliance of a single tip; between tips t
-and t' it is
+Here n = grad phi / |grad phi| is the direction of pressing. C(s, s) is interpolated from both sides
+and completed by the interpolation error (:mod:`avatar_core.fem.patch_on_plane`). K is the kernel of
+the tip field with a tenth of the patch radius. gamma_q is such that the splines take those values,
+because a sum of the values themselves would blur them. gamma is the compliance of a single tip;
+between tips t and t' it is
 
     C_tt' = f_t . C f_t',    f_t = w(p_t) n(p_t),
 
-a Gram matrix. What it blurs under a tip itself, gamma - f_t . C f_t, is local: a dent of that tip.
+a Gram matrix. Its blur under a tip itself, gamma - f_t . C f_t, is local: a dent of that tip.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ SMOOTHING = 0.1  # standard deviation of K, in patch radii
 BEYOND = 1.25  # times the largest value around it, at most, is a coefficient of gamma
 MAX_STENCIL = 27 * 6  # load positions that carry one tip, at most: six at each grid point of a cell
 
-# What carries a tip, by the organ's shape alone: shell (nx, ny, nz) bool, the n grid points that a
-# tip may need; normal (n, 3), the direction of pressing; carrier, weight (n, 3 or 6), load
-# positions and their weights; missed (n,), E* R_p times what these miss of C(s, s)
+# Load positions that carry a tip, by the organ's shape alone: shell (nx, ny, nz) bool, the n grid
+# points that a tip may need; normal (n, 3), the direction of pressing; carrier, weight (n, 3 or 6),
+# load positions and their weights; missed (n,), E* R_p times the interpolation error of C(s, s)
 TipCarriers = namedtuple("TipCarriers", ["shell", "normal", "carrier", "weight", "missed"])
 
 # row (nx, ny, nz) int32: the row of a grid point, -1 far from the surface; carrier (n_rows, 3 or
@@ -57,12 +57,14 @@ TipResponse = namedtuple(
 
 
 def tip_carriers(surface: LoadSurface, field: TipField, depth: float, height: float) -> TipCarriers:
-    """Load positions and weights at the grid points that a tip may need.
+    """Return load positions and weights at the grid points that a tip may need.
 
     Parameters
     ----------
-    surface, field : of the organ
-    depth, height : farthest tip centre below and above the surface [m]
+    surface : LoadSurface
+    field : TipField
+    depth, height : float
+        Farthest tip centre below and above the surface [m].
     """
     # Here, because the contact node needs none of it.
     from avatar_core.vademecum.tip_field import grid_normals
@@ -96,14 +98,19 @@ def make_tip_response(
     near: LocalBlocks,
     modulus: float,
 ) -> TipResponse:
-    """Sample the self-compliance where a tip is carried; elsewhere its mean stands in.
+    """Sample the self-compliance where a tip is carried; elsewhere its mean is used.
 
     Parameters
     ----------
-    surface, field, carriers : of the organ
-    load : ndarray, shape (n_positions, 3, rank), far factor of the contact compliance
-    near : LocalBlocks, its near part [m/N]
-    modulus : E* [Pa]
+    surface : LoadSurface
+    field : TipField
+    carriers : TipCarriers
+    load : ndarray, shape (n_positions, 3, rank)
+        Far factor of the contact compliance.
+    near : LocalBlocks
+        Near part of the contact compliance [m/N].
+    modulus : float
+        E* [Pa].
     """
     # Here, because the contact node needs none of it.
     from avatar_core.vademecum.tip_field import smoothed
@@ -130,7 +137,7 @@ def make_tip_response(
 
 
 def _taking(values: np.ndarray) -> np.ndarray:
-    """Coefficients of splines that take positive values, and stay positive where these jump."""
+    """Return coefficients of splines through positive values, positive where the values jump."""
     # Here, because the contact node needs none of it.
     from scipy.ndimage import maximum_filter, minimum_filter, spline_filter
 
@@ -142,11 +149,11 @@ def _taking(values: np.ndarray) -> np.ndarray:
 def sampled_at_tip(
     surface: LoadSurface, field: TipField, response: TipResponse, values: np.ndarray
 ) -> np.ndarray:
-    """Return values at the load positions (n, n_positions), interpolated to the grid as gamma is.
+    """Return values at load positions (n, n_positions), interpolated to the grid like gamma.
 
     Returns
     -------
-    ndarray float32, shape (n, nx, ny, nz)
+    ndarray of float32, shape (n, nx, ny, nz)
     """
     # Here, because the contact node needs none of it.
     from avatar_core.vademecum.tip_field import smoothed
@@ -162,7 +169,7 @@ def sampled_at_tip(
 
 
 def closest_weights(surface: LoadSurface, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Load positions and their weights at the accessible points closest to some points (n, 3)."""
+    """Return load positions and their weights at the accessible points closest to points (n, 3)."""
     # Here, because the contact node needs none of it.
     import igl
 
@@ -186,7 +193,7 @@ def _dilated(mask: np.ndarray, steps: int = 3) -> np.ndarray:
 
 @compiled(fastmath=True)
 def _self_compliance(carrier, carrier_weight, normal, load, start, slot, block):  # type: ignore[no-untyped-def]
-    """n_s . C(s, s) n_s at every sample, C interpolated from both sides."""
+    """Return n_s . C(s, s) n_s at every sample, C interpolated from both sides."""
     out = np.zeros(len(carrier))
     rank, n_carriers = load.shape[2], carrier.shape[1]
     mode = np.empty(rank)
@@ -219,9 +226,9 @@ def _self_compliance(carrier, carrier_weight, normal, load, start, slot, block):
 
 @fast
 def gather(model, data, t, cell):  # type: ignore[no-untyped-def]
-    """Weights of tip t in a cell of the grid, and with ``superposition`` their gradient.
+    """Write weights of tip t in a cell of the grid, with ``superposition`` also their gradient.
 
-    Of ``state`` it fills ``nodes[t]``, the load positions that carry the tip, their number
+    It fills ``nodes[t]`` of ``state``, the load positions that carry the tip, their number
     ``n_nodes[t]`` and ``weight[t]``: w, dw/dx, dw/dy, dw/dz of each. ``local`` is scratch.
     """
     (nx, ny, nz), (wx, wy, wz), (dx, dy, dz) = cell
@@ -259,7 +266,7 @@ def gather(model, data, t, cell):  # type: ignore[no-untyped-def]
 
 @fast
 def modal_load(model, data, t):  # type: ignore[no-untyped-def]
-    """Y^T f: the modal load of a unit normal force of tip t."""
+    """Compute Y^T f: the modal load of a unit normal force of tip t."""
     mode, n = data.mode[t], data.normal[t]
     mode[:] = np.float32(0.0)
     for i in range(data.n_nodes[t]):
@@ -271,7 +278,7 @@ def modal_load(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def modes_at_nodes(model, data, t, amplitude, values):  # type: ignore[no-untyped-def]
-    """sum_k Y_k(s_j) q_k at the load positions of a tip."""
+    """Compute sum_k Y_k(s_j) q_k at the load positions of a tip."""
     for i in range(data.n_nodes[t]):
         load = model.load[data.nodes[t, i]]
         for d in range(3):
@@ -283,9 +290,10 @@ def modes_at_nodes(model, data, t, amplitude, values):  # type: ignore[no-untype
 
 @fast
 def near_column(model, data, t):  # type: ignore[no-untyped-def]
-    """Near displacement at the nodes of a tip under its own unit normal force.
+    """Compute near displacement at a tip's nodes under its own unit normal force.
 
-    By Maxwell and Betti the block from j to m is the transpose of that from m to j: one is read.
+    By Maxwell and Betti the block from j to m is the transpose of the block from m to j: one is
+    read.
     """
     column, n = data.column[t], data.normal[t]
     column[: data.n_nodes[t]] = np.float32(0.0)
@@ -314,7 +322,7 @@ def near_column(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def near_gram(model, data, t):  # type: ignore[no-untyped-def]
-    """Near part of f . C f of one tip."""
+    """Return the near part of f . C f of one tip."""
     n, near = data.normal[t], 0.0
     n0, n1, n2 = n[0], n[1], n[2]
     for i in range(data.n_nodes[t]):
@@ -334,9 +342,9 @@ def near_gram(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def assemble_own(model, data, t, near):  # type: ignore[no-untyped-def]
-    """Compliance of a single tip on an organ at rest; it grows where access fades.
+    """Assemble the compliance of one tip on an organ at rest; it grows where access fades.
 
-    What the stencil blurs of it, gamma - f . C f, is a local dent of the tip alone.
+    The stencil's blur, gamma - f . C f, is a local dent of the tip alone.
     """
     far = np.float32(0.0)
     for k in range(data.mode.shape[1]):

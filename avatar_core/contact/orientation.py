@@ -1,9 +1,9 @@
-"""How tools turn, from the orientations that a step is given.
+"""Rotation of tools, from the orientations that a step is given.
 
 The rotation vector of a period is twice the vector part of q_now q_before*, with the sign of the
-shorter rotation: exact to second order in the angle, 4 % too short at 1 rad. Friction moves the
-contact point with it; a punch leans by the direction of its shaft. An orientation of zero is none:
-the tool has not turned, and stands along the surface's normal.
+shorter rotation. It is exact to second order in the angle, 4 % too short at 1 rad. Friction moves
+the contact point with it; a punch leans by the direction of its shaft. An orientation of zero is
+none: the tool has not turned, and stands along the surface's normal.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def composed(frame: Any, orientation: Any) -> tuple[Any, Any, Any, Any]:
 
 @inlined
 def turn_tools(model, data):  # type: ignore[no-untyped-def]
-    """The rotation of each tool in this period, and the direction of its shaft."""
+    """Compute the rotation of each tool in this period, and the direction of its shaft."""
     if not (model.friction.on or model.tilt.on):
         return
     for t in range(data.tip.shape[0]):
@@ -55,7 +55,7 @@ def _square(q):  # type: ignore[no-untyped-def]
 
 @inlined
 def _set_spin(before, now, spin):  # type: ignore[no-untyped-def]
-    """Rotation vector from one orientation to another [rad]."""
+    """Set the rotation vector from one orientation to another [rad]."""
     a, b, c, d = before[0], before[1], before[2], before[3]
     i, j, k, w = now[0], now[1], now[2], now[3]
     twice = 2.0 if a * i + b * j + c * k + d * w >= 0.0 else -2.0
@@ -66,7 +66,7 @@ def _set_spin(before, now, spin):  # type: ignore[no-untyped-def]
 
 @inlined
 def _turn(vector, q, turned):  # type: ignore[no-untyped-def]
-    """A vector of a tool's frame in the frame of its orientation."""
+    """Turn a vector of a tool's frame into the frame of its orientation."""
     x, y, z = vector[0], vector[1], vector[2]
     i, j, k, w = q[0], q[1], q[2], q[3]
     a, b, c = 2.0 * (j * z - k * y), 2.0 * (k * x - i * z), 2.0 * (i * y - j * x)

@@ -2,8 +2,8 @@
 
     0 <= lambda_t   perp   gap_t + sum_t' C_tt' lambda_t' + h_t >= 0
 
-The Newton steps of friction find the same forces at mu = 0, to 2e-6 N, but cost 1.3 times the whole
-step of two tools and 1.4 times that of three.
+The Newton steps of friction find the same forces at mu = 0, to 2e-6 N. They cost 1.3 times the
+whole step of two tools and 1.4 times the step of three.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LEAST_PIVOT = 1e-8  # of a tip's own compliance
 
 @inlined
 def solve_contact(model, data):  # type: ignore[no-untyped-def]
-    """Forces of all tips, by the cheapest solver for the effects; whether it converged."""
+    """Find all tips' forces by the cheapest solver for the effects; return convergence."""
     if model.friction.on:
         return solve_friction(model, data)
     if model.several_tools.on:
@@ -37,10 +37,10 @@ def solve_contact(model, data):  # type: ignore[no-untyped-def]
 
 @inlined
 def _sweep(model, data):  # type: ignore[no-untyped-def]
-    """Projected Gauss-Seidel on 0 <= lambda  perp  gap + C lambda + h >= 0, from the last forces.
+    """Solve 0 <= lambda  perp  gap + C lambda + h >= 0 by Gauss-Seidel, from the last forces.
 
-    With large deformation each update of a patch is a Newton step. Sweeps hardly change how tips
-    close to each other share their load; then they restart from the active-set solution. Returns
+    With large deformation each update of a patch is a Newton step. Sweeps hardly change the
+    division of a load between close tips; then they restart from the active-set solution. Returns
     whether the last sweep changed every gap by less than ``GAP_TOLERANCE``.
     """
     n_tools = data.passage.shape[0]
@@ -81,13 +81,14 @@ def _sweep(model, data):  # type: ignore[no-untyped-def]
 
 @inlined
 def _solve_active_set(model, data):  # type: ignore[no-untyped-def]
-    """Contact forces by the active-set method, as a start for the sweeps that follow.
+    """Find contact forces by the active-set method, as a start for the sweeps that follow.
 
-    Nonnegative least squares in energy (Lawson & Hanson, Solving Least Squares Problems, Sec.
-    23.3): solve for the active tips; if a force would become negative, go only as far as it
-    vanishes and release that tip; else activate the tip that penetrates deepest. Forces stay >= 0
-    and the energy decreases, however close the tips are. With large deformation this is one Newton
-    step. It may end after its last exchange without the solution: the sweeps decide on convergence.
+    The method is nonnegative least squares in energy (Lawson & Hanson, Solving Least Squares
+    Problems, Sec. 23.3). Solve for the active tips. If a force would become negative, go only as
+    far as it vanishes and release that tip; else activate the tip that penetrates deepest. Forces
+    stay >= 0 and the energy decreases, however close the tips are. With large deformation this is
+    one Newton step. It may end after its last exchange without the solution: the sweeps decide on
+    convergence.
     """
     several = data.several_tools
     _linearise(model, data)
@@ -121,7 +122,10 @@ def _solve_active_set(model, data):  # type: ignore[no-untyped-def]
 
 @inlined
 def _linearise(model, data):  # type: ignore[no-untyped-def]
-    """Gap without forces and compliance at the present forces; tips with a force are active."""
+    """Compute gaps without forces, and compliance, at the present forces.
+
+    Tips with a force are active.
+    """
     several = data.several_tools
     for t in range(data.passage.shape[0]):
         several.active_set[t] = False

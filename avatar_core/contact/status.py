@@ -9,7 +9,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 FAR_AWAY = 1e3  # coordinate of a tool without a pose [m]
-# A tip that did not enter through the surface is barred until it is outside again: a contact that
+# A tip that did not enter through the surface is barred until it is outside again. A contact that
 # began at depth would release energy that no tool has put in.
 OUTSIDE, ENTERED, BARRED = range(3)
 

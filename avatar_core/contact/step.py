@@ -1,10 +1,9 @@
 """The compiled contact step: no allocation, no exception, no I/O.
 
-Each tool tip (a sphere of centre p and radius r; of other tips, p lies r above the lowest point)
-presses at the surface point below it, along the normal n = grad phi / |grad phi|. Its force deforms
-the organ as that of a patch would, but for the dent right under the tip, which
-:mod:`avatar_core.tips.law` adds. Forces lambda of patches solve the Signorini
-conditions
+Each tool tip is a sphere of centre p and radius r; for other tips, p lies r above the lowest point.
+It presses at the surface point below it, along the normal n = grad phi / |grad phi|. Its force
+deforms the organ like the force of a patch, except for the dent right under the tip, which
+:mod:`avatar_core.tips.law` adds. Forces lambda of patches solve the Signorini conditions
 
     gap_t = phi(p_t) - r_t,   gap_t + sum_t' C_tt' lambda_t' >= 0,   lambda >= 0,  complementary,
 
@@ -14,15 +13,15 @@ For one tip on an organ at rest, W = lambda gamma lambda / 2,
 
     F = lambda [ grad phi + lambda grad gamma / 2 ]:
 
-the normal force, and the small tangential one by which a frictionless tip slides towards softer
-tissue. Without it a closed path would gain or lose energy.
+the normal force, and the small tangential force by which a frictionless tip slides towards softer
+tissue. Without the tangential force a closed path would gain or lose energy.
 
-``model`` holds what is constant (:mod:`avatar_core.contact.layout`), ``data`` what a loop keeps and
-writes (:mod:`avatar_core.contact.data`), both with a table for each effect. A stage does nothing
-for one that is not ``on``: all scenes share one compiled step, and a scene costs a branch for what
-it leaves out.
+``model`` holds the constants (:mod:`avatar_core.contact.layout`). ``data`` holds a loop's state and
+results (:mod:`avatar_core.contact.data`). Both have a table for each effect. A stage does nothing
+for an effect that is not ``on``: all scenes use one compiled step, and an absent effect costs a
+branch.
 
-Every iteration here is bounded; where one ends unconverged, the status of all tips in contact is
+Every iteration here is bounded. If one ends unconverged, the status of all tips in contact is
 NOT_CONVERGED.
 """
 
@@ -72,7 +71,7 @@ from avatar_core.tips.law import law_error, sample_law
 
 @entry
 def contact_solve(model, data):  # type: ignore[no-untyped-def]
-    """First half of a period: forces and contacts. Returns the worst status.
+    """Compute forces and contacts, the first half of a period; return the worst status.
 
     Real-time safe: allocates nothing, raises nothing, bounded iterations.
     """
@@ -81,16 +80,16 @@ def contact_solve(model, data):  # type: ignore[no-untyped-def]
 
 @entry
 def contact_deform(model, data):  # type: ignore[no-untyped-def]
-    """Second half: the cloud under these forces. Real-time safe, as :func:`contact_solve`."""
+    """Compute the cloud under these forces, the second half of a period. Real-time safe."""
     deform(model, data)
 
 
 @entry
 def force_error(model, data):  # type: ignore[no-untyped-def]
-    """Expected error of the forces: the relative error at the tip, times the force.
+    """Compute the expected error of the forces: the relative error at the tip, times the force.
 
-    Of a real tip, the patch's error counts with the part of the depth that is the patch's, and that
-    of the law is added. Real-time safe, as :func:`contact_solve`.
+    For a real tip, the patch's error counts by the patch's part of the depth, and the law's error
+    is added. Real-time safe, like :func:`contact_solve`.
     """
     out = data.out
     for t in range(data.tip.shape[0]):
@@ -136,7 +135,7 @@ def _solve_period(model, data):  # type: ignore[no-untyped-def]
 
 @inlined
 def _locate_tips(model, data):  # type: ignore[no-untyped-def]
-    """Gap and compliance of each tip on its own; returns the worst status."""
+    """Compute gap and compliance of each tip on its own; return the worst status."""
     status = OK
     for t in range(data.tip.shape[0]):
         if work_jaw(model, data, t):  # nothing of its place has changed
@@ -165,7 +164,7 @@ def _locate_tips(model, data):  # type: ignore[no-untyped-def]
 
 @inlined
 def _predict(model, data):  # type: ignore[no-untyped-def]
-    """Modes at the end of the period without any load, and their gain by a unit load."""
+    """Predict modes at the end of the period without load, and their gain by a unit load."""
     superposition = data.superposition
     if model.viscoelasticity.on:
         predict_history(model, data)
@@ -181,7 +180,7 @@ def _predict(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def _assemble_incremental(model, data):  # type: ignore[no-untyped-def]
-    """Displacement without load at each tip, and its compliance within the period."""
+    """Compute displacement without load at each tip, and its compliance within the period."""
     if not model.superposed[0]:
         return
     for t in range(data.passage.shape[0]):
@@ -201,7 +200,7 @@ def _assemble_incremental(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def write_forces(model, data):  # type: ignore[no-untyped-def]
-    """Forces on the tools and the contacts that cause them."""
+    """Write the forces on the tools and the contacts that cause them."""
     out = data.out
     n = 0
     for t in range(data.passage.shape[0]):
@@ -235,7 +234,7 @@ def write_forces(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def _write_force_at_rest(data, t):  # type: ignore[no-untyped-def]
-    """F = lambda [grad phi + lambda grad gamma / 2], of a single tip on an organ at rest."""
+    """Write F = lambda [grad phi + lambda grad gamma / 2], of one tip on an organ at rest."""
     force = data.force[t]
     for d in range(3):
         data.out.force[t, d] = force * (data.slope[t, d] + 0.5 * force * data.self_slope[t, d])
@@ -243,7 +242,7 @@ def _write_force_at_rest(data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def _add_fading_force(model, data, t):  # type: ignore[no-untyped-def]
-    """Derivative of the compliance that is added where access fades."""
+    """Add the derivative of the compliance that grows where access fades."""
     chi = data.access[t]
     if chi < 1.0:
         fading = model.softness[0] / (chi * chi)

@@ -4,21 +4,21 @@ The organ is linear: the effects of other tips, load history, weight and inertia
 
     u(s) = sum_k Y_k(s) q_k + near field,      q = free + gain * (Y^T f),
 
-with f the loads of all tips, ``free`` the modes at the end of the period without any load, and
-``gain`` their displacement within the period by a unit load (0 and 1 without viscoelasticity and
+with f the loads of all tips and ``free`` the modes at the end of the period without any load.
+``gain`` is their displacement within the period by a unit load (0 and 1 without viscoelasticity and
 inertia). The near field follows the same equation; its history is a distribution of loads, and it
 has no mass.
 
-The force on a tip is the derivative of the elastic energy at fixed loads and history. With u_j the
-displacement at load position j by all causes, U = sum_j w_j u_j that of the patch, and g the force
-on the tissue,
+The force on a tip is the derivative of the elastic energy at fixed loads and history. Let u_j be
+the displacement at load position j by all causes, U = sum_j w_j u_j the displacement of the patch,
+and g the force on the tissue. Then
 
-    F_d = - g . d(target)/dp_d + sum_j dw_j/dp_d g . u_j + g . e / 2 d(gamma - f . C f)/dp_d,
+    F_d = - g . d(target)/dp_d + sum_j dw_j/dp_d g . u_j + g . e / 2 d(gamma - f . C f)/dp_d.
 
-where target is the displacement that contact prescribes for the patch (along n only, unless the tip
-sticks). gamma - f . C f, what the stencil blurs of the compliance under the tip itself
-(:mod:`avatar_core.contact.organ_response`), is a dent of this tip alone, under the force e on an
-elastic organ that is dented alike.
+target is the displacement that contact prescribes for the patch (along n only, unless the tip
+sticks). gamma - f . C f is the stencil's blur of the compliance under the tip itself
+(:mod:`avatar_core.contact.organ_response`). It is a dent of this tip alone, under the force e on an
+elastic organ with the same dent.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ SUPERPOSITION = kind(
 
 @fast
 def free_tip_displacement(model, data, t):  # type: ignore[no-untyped-def]
-    """Displacement of a tip's patch without any load in this period."""
+    """Compute the displacement of a tip's patch without any load in this period."""
     superposition = data.superposition
     free = superposition.free_displacement[t]
     modes_at_nodes(model, data, t, superposition.free, superposition.displacement)
@@ -81,7 +81,7 @@ def free_tip_displacement(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def superpose_modes(model, data):  # type: ignore[no-untyped-def]
-    """The modes under the forces that were found."""
+    """Compute the modes under the forces that were found."""
     superposition = data.superposition
     if not model.superposed[0]:
         return
@@ -102,7 +102,7 @@ def superpose_modes(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def _displacement_at_nodes(model, data, t):  # type: ignore[no-untyped-def]
-    """Displacement at the nodes of a tip by all causes, and by its unit normal force at rest."""
+    """Compute displacement at a tip's nodes by all causes, and by its unit normal force at rest."""
     superposition = data.superposition
     displacement, unit = superposition.displacement, superposition.unit_displacement
     modes_at_nodes(model, data, t, data.mode[t], unit)
@@ -127,7 +127,7 @@ def _displacement_at_nodes(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def write_superposed_force(model, data, tip, t):  # type: ignore[no-untyped-def]
-    """F of the module's docstring, without the terms of large deformation and fading access."""
+    """Write F of the module's docstring, without large deformation and fading access."""
     superposition = data.superposition
     if not model.superposed[0]:
         return
@@ -171,7 +171,7 @@ def write_superposed_force(model, data, tip, t):  # type: ignore[no-untyped-def]
 
 @fast
 def _normal_gradient(model, data, t, p):  # type: ignore[no-untyped-def]
-    """dn/dp = (I - n n^T) grad g / |g|, g = grad phi."""
+    """Return dn/dp = (I - n n^T) grad g / |g|, g = grad phi."""
     n, hessian = data.normal[t], data.superposition.hessian
     cell = cell_at(model.origin, model.spacing[0], p)
     second_derivatives(model.distance, cell, model.spacing[0], hessian)

@@ -1,7 +1,7 @@
-"""The times of an accuracy curve, measured on the machine that builds it.
+"""Times of an accuracy curve, measured on the machine that builds it.
 
-They are the processor's: what a loop waits for whose thread nothing interrupts, which real-time
-priority gives it. Wall time would measure the other processes of the moment instead.
+They are processor times: a loop whose thread nothing interrupts, by real-time priority, waits that
+long. Wall time would measure the other processes of the moment instead.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ def timed(
     curve: AccuracyCurve,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> AccuracyCurve:
-    """Return the same curve with the processor's time of steps on this machine, one tool 5 mm deep.
+    """Return the curve with processor times of steps on this machine, one tool 5 mm deep.
 
-    Each point has the median over rounds of its p50 and p99. All points take their turn in a round,
-    so that a neighbour who disturbs this machine's memory for a second disturbs one round of each,
-    not all rounds of some.
+    Each point has the median over rounds of its p50 and p99. All points take their turn in a round.
+    A neighbour that disturbs this machine's memory for a second then disturbs one round of each
+    point, not all rounds of some.
     """
     path = slide(vademecum, _TIP.offset, _DEPTH, _STEPS * 1e-4)[:, None]
     shape, n_modes = Shape.of(vademecum, (_TIP,)), vademecum.n_modes
@@ -56,7 +56,7 @@ def timed(
 
 
 def _step_times(data: ContactData, path: np.ndarray) -> np.ndarray:
-    """Of the processor, for each step of a path [s]."""
+    """Return the processor time of each step of a path [s]."""
     data.reset()
     times = np.empty(len(path))
     for k, tips in enumerate(path):

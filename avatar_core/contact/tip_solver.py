@@ -1,4 +1,4 @@
-"""The force of a tip at a depth, or its depth at a force, with all that adds to its dent.
+"""The force of a tip at a depth, or its depth at a force, with all terms of its dent.
 
     d = delta + eta + F (gamma - c) + k h        (:mod:`avatar_core.tips.law`)
 
@@ -24,7 +24,7 @@ TOLERANCE = 1e-13  # [m] of depth, or relative of the force
 
 @fast
 def _find_place(model, data, t, of_depth, of_load, target):  # type: ignore[no-untyped-def]
-    """The place where of_depth [delta + eta + h] + of_load F / E* is ``target``.
+    """Find the place where of_depth [delta + eta + h] + of_load F / E* is ``target``.
 
     Safeguarded Newton; eta is added by large strain at the tip, h by large deformation.
     """
@@ -65,11 +65,11 @@ def _find_place(model, data, t, of_depth, of_load, target):  # type: ignore[no-u
 
 @inlined
 def solve_tip(model, data, t, depth, compliance):  # type: ignore[no-untyped-def]
-    """The force of a tip at a depth [m], the organ's own compliance in this period being known.
+    """Return the force of a tip at a depth [m], for the organ's own compliance in this period.
 
-    For viscoelastic tissue the force is e / gain + held, e that on an elastic organ. Of modes with
-    mass hardly any compliance is left in a period: it may be less than c, but the depth still grows
-    with the force.
+    In viscoelastic tissue the force is e / gain + held, with e the force on an elastic organ. Modes
+    with mass have hardly any compliance left in a period. It may be less than c, but the depth
+    still grows with the force.
     """
     law = data.law
     held = held_load(model, data, t)
@@ -114,9 +114,9 @@ def evaluate_tip(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def added_depth(model, data, t):  # type: ignore[no-untyped-def]
-    """Depth beside C lambda at the present force: of the dent and of large deformation.
+    """Return the depth beside C lambda at the present force [m], and its derivative [m/N].
 
-    Returns it [m] and its derivative by the force [m/N].
+    It comes from the dent and from large deformation.
     """
     depth = tangent = 0.0
     if model.law.on:
@@ -130,7 +130,7 @@ def added_depth(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def add_tip_force(model, data, t):  # type: ignore[no-untyped-def]
-    """The derivative of the dent's energy at constant force, relaxed as the force has."""
+    """Add the derivative of the dent's energy at constant force, relaxed like the force."""
     law = data.law
     if not model.law.on:
         return
@@ -151,8 +151,9 @@ def add_tip_force(model, data, t):  # type: ignore[no-untyped-def]
 
 @entry
 def loads_at_depths(model, data, softness, depth, load):  # type: ignore[no-untyped-def]
-    """F / E* [m^2] of the first tip at depths [m], over an organ that gives way by ``softness``
-    F / E* beside the dent, E* (gamma - c) [1/m]; all (n,), the last is written.
+    """Write F / E* [m^2] of the first tip at depths [m], all (n,), to ``load``.
+
+    The organ gives way by ``softness`` F / E* beside the dent, softness = E* (gamma - c) [1/m].
     """
     for i in range(len(load)):
         data.law.place[0] = 0.0

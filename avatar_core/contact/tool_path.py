@@ -14,9 +14,11 @@ _LEVEL_TOLERANCE = 1e-6  # [m]
 
 
 def inner_positions(vademecum: Vademecum, margin: float = 12e-3) -> np.ndarray:
-    """Load positions with full access ``margin`` [m] around them (all, if there are none).
+    """Return load positions with full access within ``margin`` [m].
 
-    Checked above and below the surface: in a fold, access fades inside the organ first.
+    All positions if there are none.
+
+    Access is checked above and below the surface: in a fold it fades inside the organ first.
     """
     surface, field = vademecum.surface, vademecum.tip_field
     around = margin * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
@@ -29,13 +31,13 @@ def inner_positions(vademecum: Vademecum, margin: float = 12e-3) -> np.ndarray:
 
 
 def middle_of_access(vademecum: Vademecum) -> int:
-    """The load position nearest to the middle of the accessible surface, away from its rim."""
+    """Return the load position nearest to the middle of the accessible surface, off its rim."""
     centers, inner = vademecum.surface.centers, inner_positions(vademecum)
     return int(inner[np.argmin(np.linalg.norm(centers[inner] - centers.mean(axis=0), axis=1))])
 
 
 def starts_apart(vademecum: Vademecum, n: int) -> list[int]:
-    """Load positions for several tools: the middle one, then each the farthest from the others."""
+    """Return positions for several tools: the middle one, then each farthest from the others."""
     centers, inner = vademecum.surface.centers, inner_positions(vademecum)
     starts = [middle_of_access(vademecum)]
     while len(starts) < n:
@@ -68,15 +70,22 @@ def slide(
 ) -> np.ndarray:
     """Return a slide at constant depth over the accessible surface, shape (n, 3) [m].
 
-    The centre keeps phi = radius - depth and heads along ``heading``; it turns back where the
+    The centre keeps phi = radius - depth and heads along ``heading``. It turns back where the
     access fades, so that any length can be travelled.
 
     Parameters
     ----------
-    radius, depth : float
-        Radius and depth of the tip and of its penetration of the surface at rest [m].
+    vademecum : Vademecum
+    radius : float
+        Radius of the tip [m].
+    depth : float
+        Penetration of the surface at rest [m].
     length, step : float
-        Travelled and between periods [m].
+        Length of the path, and distance between two periods [m].
+    heading : tuple[float, float, float]
+        Direction of travel.
+    position : int or None
+        Load position of the start; None for the middle of the access.
 
     Raises
     ------
@@ -102,12 +111,12 @@ def slide(
 def push_and_slide(
     vademecum: Vademecum, radius: float, push: float, depth: float, n: int, position: int
 ) -> np.ndarray:
-    """A push and retreat, then a slide, shape (n, 3) [m]: a third and two thirds of the steps.
+    """Return a push and retreat, then a slide, (n, 3) [m]: a third and two thirds of the steps.
 
     Parameters
     ----------
     push, depth : float
-        Push and depth of the push and of the slide [m].
+        Depths of the push and of the slide [m].
     """
     third = n // 3
     way_in = palpation(vademecum, radius, depth, third, position)[: third // 2]
@@ -128,7 +137,7 @@ def _gradient(field: TipField, p: np.ndarray) -> np.ndarray:
 
 
 def _at_level(field: TipField, p: np.ndarray, level: float) -> np.ndarray:
-    """A point with phi = level, by three Newton steps along grad phi from a point close to it."""
+    """Return a point with phi = level, by three Newton steps along grad phi from a close point."""
     gradient = np.zeros(3)
     for _ in range(3):
         phi = evaluate(field.distance, field.origin, field.spacing[0], p, gradient, FAR)

@@ -1,8 +1,8 @@
-"""The effects that a scene may name: one file each, and none of it runs unless a scene names it.
+"""Effects that a scene may name: one file each. An effect does not run unless a scene names it.
 
-Each has two halves. Offline, a frozen dataclass is checked and turned into the arrays that the step
-needs; online, compiled functions work on these arrays. One that is off has no arrays, and costs the
-step a branch.
+Each effect has two halves. Offline, a frozen dataclass is checked and turned into the arrays that
+the step needs. Online, compiled functions work on these arrays. An effect that is off has no
+arrays, and costs the step a branch.
 """
 
 from __future__ import annotations

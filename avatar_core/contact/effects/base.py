@@ -21,22 +21,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Ground:
-    """Ground on which an effect lays out its arrays.
+    """The inputs from which an effect lays out its arrays.
 
     Attributes
     ----------
     vademecum : Vademecum
-        As the effects of the scene adapt it.
-    tips, effects : Sequence[Tip]
+        Vademecum after adaptation by the scene's effects.
+    tips, effects : Sequence[Tip], Sequence[Effect]
         Tips and effects of the scene.
     response : TipResponse
-        TipResponse of the organ, on the grid of its tip field.
+        Response of the organ, on the grid of its tip field.
     n_modes : int
-        n modes of the contact compliance, with those of zero that fill up a row.
+        Number of modes of the contact compliance, with the zero modes that fill up a row.
     reach : float
         Longest distance between the two positions of a block of the near field [m].
-    large_start : ndarray
-        Large start of the modes of large deformation among those of the cloud, (n_regions + 1,).
+    large_start : ndarray, shape (n_regions + 1,)
+        First mode of large deformation of each region, among those of the cloud.
     period : float
         Period of the steps [s].
     """
@@ -58,13 +58,13 @@ class Effect(ABC):
     Attributes
     ----------
     Constants : ClassVar[Any]
-        Kind of the arrays that a step reads of it; None if it acts through the vademecum.
+        Kind of the effect's arrays that a step reads; None if it acts through the vademecum.
     State : ClassVar[Any]
-        Kind of what it keeps between steps, and of its scratch; None if there is nothing.
+        Kind of the arrays that it keeps between steps, and its scratch; None if it has none.
     superposed : ClassVar[bool]
         Whether the displacement of a tip follows from all loads and histories together.
     moving : ClassVar[bool]
-        Whether it moves the organ by more than the loads of the moment do.
+        Whether it moves the organ beyond the present loads.
 
     Raises
     ------
@@ -73,7 +73,7 @@ class Effect(ABC):
     """
 
     name: ClassVar[str]
-    text: ClassVar[str]  # what it does, one line
+    text: ClassVar[str]  # its purpose, one line
     Constants: ClassVar[Any] = None
     State: ClassVar[Any] = None
     superposed: ClassVar[bool] = False
@@ -93,7 +93,7 @@ class Effect(ABC):
 
     @classmethod
     def example(cls) -> Effect:
-        """One to measure and test it by, under which a tip that slides 5 mm deep stays in touch."""
+        """Return an example, under which a tip that slides 5 mm deep stays in touch."""
         return cls()
 
     def adapted(self, vademecum: Vademecum) -> Vademecum:
@@ -106,7 +106,7 @@ class Effect(ABC):
 
     @staticmethod  # noqa: B027 (most begin at zero)
     def begin(model: Any, state: Any) -> None:
-        """Set what is not its first value in the state of an organ at rest."""
+        """Set the state of an organ at rest where it differs from the first values."""
 
 
 _E = TypeVar("_E", bound=Effect)

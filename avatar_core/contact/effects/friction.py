@@ -3,14 +3,14 @@
 A tip in contact has an *anchor*, a material point s_a of the organ's surface at rest. While the tip
 sticks, the anchor moves with the tip's contact point c = p - r n: the displacement of the patch is
 
-    U = y + n (gap - n . y),    y = c - s_a,
+    U = y + n (gap - n . y),    y = c - s_a.
 
-and the force on the tissue g = C^-1 U has a normal part lambda = -n . g >= 0 and a tangential one
-tau, |tau| <= mu_s lambda. Where it would exceed that, the anchor slides along tau until
-|tau| = mu_k lambda, the slip of maximum dissipation (Moreau). Both parts are found together, tip
-after tip, by projection (Alart & Curnier, CMAME 92:353, 1991). The force is the derivative of the
-elastic energy W(p, s_a) at a fixed anchor, so that the work on a closed path is the dissipation
-mu_k lambda |slip| >= 0. A tool that turns moves its contact point.
+The force on the tissue g = C^-1 U has a normal part lambda = -n . g >= 0 and a tangential part tau,
+|tau| <= mu_s lambda. Where tau would exceed this limit, the anchor slides along tau until |tau| =
+mu_k lambda, the slip of maximum dissipation (Moreau). Both parts are found together, tip after tip,
+by projection (Alart & Curnier, CMAME 92:353, 1991). The force is the derivative of the elastic
+energy W(p, s_a) at a fixed anchor. The work on a closed path is therefore the dissipation mu_k
+lambda |slip| >= 0. A tool that turns moves its contact point.
 
 :mod:`avatar_core.contact.friction_solver` finds both parts.
 """
@@ -69,6 +69,7 @@ class Friction(Effect):
             )
 
     def lay_out(self, ground: Ground) -> Any:
+        """Return coefficients and tangential compliance of the tips."""
         return self.Constants(np.array([self.static, self.kinetic]))
 
 
@@ -77,7 +78,7 @@ NONE, STICKS, SLIPS = range(3)  # state of a tip in the last period
 
 @fast
 def gather_friction(model, data, t):  # type: ignore[no-untyped-def]
-    """Modal loads of unit forces along x, y and z, and the near part of the tip's compliance."""
+    """Compute modal loads of unit forces along x, y and z, and the tip's near compliance."""
     if not model.friction.on:
         return
     mode = data.friction.mode[t]
@@ -92,7 +93,7 @@ def gather_friction(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def near_between(model, data, t, s):  # type: ignore[no-untyped-def]
-    """sum_ij w_i B_ij w_j: displacement of tip t's patch by unit forces of tip s."""
+    """Return sum_ij w_i B_ij w_j: displacement of tip t's patch by unit forces of tip s."""
     near = data.friction.near[t, s]
     near[:] = 0.0
     for i in range(data.n_nodes[s]):
@@ -118,7 +119,7 @@ def force_on_tissue(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def tangential_force(data, t):  # type: ignore[no-untyped-def]
-    """|tau|."""
+    """Return |tau| [N]."""
     n, g = data.normal[t], data.friction.push[t]
     along = g[0] * n[0] + g[1] * n[1] + g[2] * n[2]
     return np.sqrt(max(0.0, g[0] * g[0] + g[1] * g[1] + g[2] * g[2] - along * along))
@@ -159,14 +160,14 @@ def add_near_friction(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def force_squared(data, t):  # type: ignore[no-untyped-def]
-    """|g|^2."""
+    """Return |g|^2 [N^2]."""
     g = data.friction.push[t]
     return g[0] * g[0] + g[1] * g[1] + g[2] * g[2]
 
 
 @fast
 def add_torque(model, data, t):  # type: ignore[no-untyped-def]
-    """Moment about the tip's centre of the force at its contact point, -r n x F."""
+    """Add the moment about the tip's centre of the force at its contact point, -r n x F."""
     if not model.friction.on:
         return
     n, r, f, torque = data.normal[t], model.tip_offset[t], data.out.force[t], data.out.torque[t]

@@ -1,7 +1,7 @@
 """Inertia: the organ's mass in its modes of vibration, for fast motion and after release.
 
-The modes are orthonormal in energy. Rotated so that the mass rho X^T M X is diagonal too (m_k, with
-the angular frequencies 1 / sqrt(m_k)), each is an independent oscillator,
+The modes are orthonormal in energy. They are rotated so that the mass rho X^T M X is diagonal too
+(m_k, with the angular frequencies 1 / sqrt(m_k)). Each is then an independent oscillator,
 
     m_k q'' + d_k q' + R_k(q) = Y_k . f,        R = q, or relaxed by viscoelasticity,
 
@@ -10,7 +10,7 @@ integrated by the midpoint rule,
     2 m (v_mid - v) / dt + (R + R_new) / 2 + d v_mid = Y . f,     q_new = q + dt v_mid,
 
 which conserves energy up to d v_mid^2 dt (Simo & Tarnow, ZAMP 43:757, 1992). The loads f of a
-period satisfy the contact conditions at its end: on a tip at rest their work is -lambda gap <= 0,
+period satisfy the contact conditions at its end. On a tip at rest their work is -lambda gap <= 0,
 so contact never adds energy. The modes of the contact compliance beside the global ones have no
 mass, nor has its near field: they follow at once.
 """
@@ -53,10 +53,11 @@ class Inertia(Effect):
     damping: float = quantity("-", 0.0, 2.0, "of every mode, over its critical damping", 0.1)
 
     def require(self, vademecum: Vademecum) -> None:
+        """Refuse a vademecum without the mass of the organ."""
         require_body(vademecum, self.name)
 
     def adapted(self, vademecum: Vademecum) -> Vademecum:
-        """In its modes of vibration, slowest first."""
+        """Return the vademecum in its modes of vibration, slowest first."""
         far, body = vademecum.far, vademecum.body
         assert body is not None  # by `require`
         _, turn = np.linalg.eigh(body.mass)
@@ -66,6 +67,7 @@ class Inertia(Effect):
         return replace(vademecum, far=turned, body=body.mixed(turn))
 
     def lay_out(self, ground: Ground) -> Any:
+        """Return masses, damping and period of the modes."""
         body = ground.vademecum.body
         assert body is not None
         mass = self.density * np.maximum(np.diag(body.mass), 0.0)
@@ -74,14 +76,14 @@ class Inertia(Effect):
 
     @staticmethod
     def begin(model: Any, state: Any) -> None:
-        """Deformed by its weight, if that is simulated."""
+        """Deform the organ by its weight, if that is simulated."""
         if model.self_weight is not None:
             state.modes[:] = model.self_weight.amplitude
 
 
 @fast
 def predict_inertia(model, data):  # type: ignore[no-untyped-def]
-    """Modes at the end of the period without any load, and their gain by a unit load."""
+    """Predict the modes at the end of the period without load, and their gain by a unit load."""
     superposition, past, prony, oscillator = (
         data.superposition,
         data.viscoelasticity,

@@ -50,9 +50,11 @@ class Respiration(Effect):
 
     @classmethod
     def example(cls) -> Respiration:
+        """Return a breath to measure and test."""
         return cls(amplitude=1e-3)
 
     def lay_out(self, ground: Ground) -> Any:
+        """Return period, shape and stroke of the breath."""
         return self.Constants(
             self.amplitude * np.array(self.axis),
             np.array([self.period, float(self.dwell), ground.period]),
@@ -77,7 +79,7 @@ def to_organ_frame(model, data):  # type: ignore[no-untyped-def]
 
 @inlined
 def to_world_frame(model, data):  # type: ignore[no-untyped-def]
-    """Contacts back to the world's frame; the frames do not rotate, so forces stay the same."""
+    """Move contacts back to the world's frame; frames do not rotate, so forces stay the same."""
     if not model.respiration.on:
         return
     for i in range(data.out.n_contacts[0]):
@@ -87,7 +89,7 @@ def to_world_frame(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def shift_cloud(model, data):  # type: ignore[no-untyped-def]
-    """Deformed positions to the world's frame; displacements stay relative to the organ."""
+    """Move deformed positions to the world's frame; displacements stay relative to the organ."""
     breath = data.respiration
     if not model.respiration.on:
         return

@@ -1,7 +1,8 @@
 """Gravity: the organ sags under its own weight, a constant load.
 
-The modes X are orthonormal in energy; the Galerkin solution for a body force rho g therefore has
-the amplitudes X^T M 1 rho g, M the mass matrix of unit density. Viscoelastic tissue has relaxed.
+The modes X are orthonormal in energy. The Galerkin solution for a body force rho g therefore has
+the amplitudes X^T M 1 rho g, with M the mass matrix of unit density. Viscoelastic tissue has
+relaxed.
 """
 
 from __future__ import annotations
@@ -42,10 +43,12 @@ class SelfWeight(Effect):
         object.__setattr__(self, "direction", direction(self.direction, self.name, "direction"))
 
     def require(self, vademecum: Vademecum) -> None:
+        """Refuse a vademecum without the mass of the organ."""
         require_body(vademecum, self.name)
 
     @classmethod
     def example(cls) -> SelfWeight:
+        """Return a light weight to measure and test."""
         return cls(gravity=1.0)
 
     def sag(self, vademecum: Vademecum) -> np.ndarray:
@@ -55,6 +58,7 @@ class SelfWeight(Effect):
         return np.asarray(vademecum.body.weight @ force)
 
     def lay_out(self, ground: Ground) -> Any:
+        """Return the amplitudes of the weight."""
         prony = find(ground.effects, Viscoelasticity)
         softened = 1.0 / (1.0 - sum(prony.g)) if prony else 1.0
         sag = softened * self.sag(ground.vademecum)

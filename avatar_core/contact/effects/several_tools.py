@@ -2,15 +2,15 @@
 
     gap_t + sum_t' C_tt' lambda_t' >= 0,    C_tt' = f_t . C f_t' + D_tt' n_t . n_t'
 
-with the far field between all tips and the near field between tips that are close. What the
-stencils blur of C, b_t = gamma - f_t . C f_t under each tip, they blur between both too: at the
+with the far field between all tips and the near field between tips that are close. The stencils
+blur C under each tip by b_t = gamma - f_t . C f_t. Between two tips they blur it too: at the
 distance rho of their contacts
 
     D = sqrt(b_t b_t') Q(rho / R_p),
 
-Q of :mod:`avatar_core.fem.patch_on_plane`. C is that of patches; what a real tip does to the
-surface beside it is not. As under the tip itself (:mod:`avatar_core.tips.law`), what
-a patch does to another on a half-space is taken off, and what a tip does is put in its place,
+Q of :mod:`avatar_core.fem.patch_on_plane`. C is the compliance of patches; a real tip moves the
+surface beside it differently. Like under the tip itself (:mod:`avatar_core.tips.law`), the effect
+of one patch on another on a half-space is taken off, and the effect of a tip put in its place,
 
     D += [1 / (pi sqrt(rho^2 + w_t^2 + w_t'^2)) - P(rho / R_p) / R_p] / E*,
 
@@ -67,13 +67,14 @@ class SeveralTools(Effect):
     superposed: ClassVar[bool] = True
 
     def lay_out(self, ground: Ground) -> Any:
+        """Return the arrays that couple the tools."""
         radius = np.array([ground.vademecum.surface.patch_radius])
         return self.Constants(np.array([ground.reach]), radius, meeting_table())
 
 
 @inlined
 def couple_near_fields(model, data):  # type: ignore[no-untyped-def]
-    """Near fields between all pairs of tips in contact; with friction, whether they overlap."""
+    """Couple near fields between all pairs of tips in contact; with friction, note overlaps."""
     several = data.several_tools
     if not model.several_tools.on:
         return
@@ -94,7 +95,7 @@ def couple_near_fields(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def place_beside(model, data, t, s):  # type: ignore[no-untyped-def]
-    """D of two tips in contact, and its slope."""
+    """Compute D of two tips in contact, and its slope."""
     several, table = data.several_tools, model.law
     square = 0.0
     for d in range(3):
@@ -117,7 +118,7 @@ def place_beside(model, data, t, s):  # type: ignore[no-untyped-def]
 
 @fast
 def add_history_beside(model, data, t):  # type: ignore[no-untyped-def]
-    """Add to a tip's displacement without load what the others' dents remember, at the tip [m]."""
+    """Add the others' remembered dents to a tip's displacement without load [m]."""
     if not model.several_tools.on:
         return
     for s in range(data.passage.shape[0]):
@@ -130,7 +131,7 @@ def add_history_beside(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def derivative_beside(model, data, t, p, d, sharper):  # type: ignore[no-untyped-def]
-    """The derivative of what tips do to each other by D, along one axis, at constant forces.
+    """Return the derivative of the tips' coupling by D, along one axis, at constant forces.
 
     The contact of a tip is at p - phi n; ``sharper`` is half the derivative of b_t.
     """
@@ -185,7 +186,10 @@ def _are_near(model, data, t, s):  # type: ignore[no-untyped-def]
 
 @fast
 def _couple_pair(model, data, t, s):  # type: ignore[no-untyped-def]
-    """By Maxwell and Betti the block from m to j is the transpose of that from j to m."""
+    """Couple the near fields of two tips.
+
+    By Maxwell and Betti the block from m to j is the transpose of the block from j to m.
+    """
     there, back = data.several_tools.column[t, s], data.several_tools.column[s, t]
     there[: data.n_nodes[s]] = np.float32(0.0)
     back[: data.n_nodes[t]] = np.float32(0.0)
@@ -214,7 +218,7 @@ def _couple_pair(model, data, t, s):  # type: ignore[no-untyped-def]
 
 @fast
 def assemble_coupling(data):  # type: ignore[no-untyped-def]
-    """Compliance between the tips."""
+    """Assemble the compliance between the tips."""
     superposition, several = data.superposition, data.several_tools
     for t in range(data.passage.shape[0]):
         for s in range(t):

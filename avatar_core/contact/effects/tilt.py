@@ -1,22 +1,22 @@
 """A flat punch that leans: the torque that rights it, and the depth to which its edge sinks first.
 
-The face of a punch of radius a leans by an angle off the surface, of which s is the sine. Pressed
-by F into a half-space it touches all over as long as t <= 1, and then at an edge only,
+The face of a punch of radius a leans off the surface by an angle with the sine s. Pressed by F into
+a half-space it touches all over as long as t <= 1, and then at an edge only,
 
-    t = 4 E* a^2 s / F,      Gamma = F^2 / (4 E* a) [1 - w(t)],      M = F a w'(t),
+    t = 4 E* a^2 s / F,      Gamma = F^2 / (4 E* a) [1 - w(t)],      M = F a w'(t).
 
-Gamma being the complementary energy at the depth of its centre, dGamma/dF, and M the torque about
-it, -dGamma/ds. Touching all over, M = 4/3 E* a^3 s and the force is that of an upright punch
+Gamma is the complementary energy. The depth of the punch's centre is dGamma/dF, and M is the torque
+about it, -dGamma/ds. Touching all over, M = 4/3 E* a^3 s and the force is that of an upright punch
 (Gladwell, Contact Problems in the Classical Theory of Elasticity, 1980): w = t^2 / 6. Beyond,
 
     w'(t) = 1 - 2/3 [1 + 3/4 (t - 1)]^(-2/3)
 
-goes on with the same value and slope, and ends as the contact of an edge must: over a, it reaches
-inwards as F^(2/3), so that M misses F a by t^(-2/3). Boundary elements have a torque up to 1.6 %
-larger, at t = 1.9, and a depth of the edge within 0.5 % of a s.
+continues with the same value and slope. It ends like the contact of an edge: relative to a, the
+contact reaches inwards as F^(2/3), so that M misses F a by t^(-2/3). Boundary elements have a
+torque up to 1.6 % larger, at t = 1.9, and a depth of the edge within 0.5 % of a s.
 
 s is the sine between the tool's axis and the mean of the surface's normals over a spacing of the
-tip field: a force made of it does not jump. Other tips do not feel that they lean.
+tip field. The mean makes the force continuous. Other tips do not respond to leaning.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _UPRIGHT = 1e-9  # sine below which a punch does not lean
 
 @dataclass(frozen=True)
 class Tilt(Effect):
-    """Flat punches lean as their poses say, and are righted by a torque."""
+    """Flat punches lean by their poses, and are righted by a torque."""
 
     name: ClassVar[str] = "tilt"
     text: ClassVar[str] = "a flat punch that leans touches with its edge and is righted by a torque"
@@ -77,6 +77,7 @@ class Tilt(Effect):
 
     def lay_out(self, ground: Ground) -> Any:
         # Here, because the contact node needs none of it.
+        """Return the radii of flat punches and the surface's normals."""
         from avatar_core.vademecum.tip_field import grid_normals
 
         self.require_flat(ground.tips)
@@ -91,7 +92,7 @@ class Tilt(Effect):
 
 @fast
 def sample_tilt(model, data, t, cell):  # type: ignore[no-untyped-def]
-    """How a tip leans; returns how deep its edge is below the centre of its face, a s [m]."""
+    """Compute a tip's lean; return its edge's depth below the centre of its face, a s [m]."""
     tilt, punches = data.tilt, model.tilt
     if not model.tilt.on:
         return 0.0
@@ -119,7 +120,7 @@ def sample_tilt(model, data, t, cell):  # type: ignore[no-untyped-def]
 
 @fast
 def _righting(ratio):  # type: ignore[no-untyped-def]
-    """w'(t), the torque over F a."""
+    """Return w'(t), the torque over F a."""
     if ratio <= 1.0:
         return ratio / 3.0
     return 1.0 - 2.0 / 3.0 * (1.0 + 0.75 * (ratio - 1.0)) ** (-2.0 / 3.0)
@@ -127,8 +128,9 @@ def _righting(ratio):  # type: ignore[no-untyped-def]
 
 @fast
 def evaluate_tilt(model, data, t, load):  # type: ignore[no-untyped-def]
-    """What leaning adds to the depth of the lowest point [m], to its derivative by the load F / E*
-    [1/m], and to the stored energy over E* [m^3].
+    """Return the changes by leaning of the lowest point's depth, its slope and the stored energy.
+
+    They are a depth [m], its derivative by the load F / E* [1/m], and an energy over E* [m^3].
     """
     if not model.tilt.on:
         return 0.0, 0.0, 0.0
@@ -150,9 +152,11 @@ def evaluate_tilt(model, data, t, load):  # type: ignore[no-untyped-def]
 
 @fast
 def add_righting(model, data, t, stiffness, elastic, relaxed):  # type: ignore[no-untyped-def]
-    """The torque that rights a tip, and the force towards where the surface would: -M ds.
+    """Add the torque that rights a tip, and its force towards less lean: -M ds.
 
-    stiffness : E* [Pa]; elastic : F on an elastic organ [N]; relaxed : of it, what is left
+    stiffness : E* [Pa]
+    elastic : F on an elastic organ [N]
+    relaxed : fraction of it that is left
     """
     tilt = data.tilt
     if not model.tilt.on:

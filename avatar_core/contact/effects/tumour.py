@@ -29,6 +29,7 @@ class Tumour(Effect):
     )
 
     def require(self, vademecum: Vademecum) -> None:
+        """Refuse a vademecum without a tumour, or without the contrast."""
         coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
         ranges = [(c.low, c.high) for c in coordinates if c.name == "contrast"]
         if not ranges and vademecum.contrast is None:
@@ -45,7 +46,7 @@ class Tumour(Effect):
             )
 
     def adapted(self, vademecum: Vademecum) -> Vademecum:
-        """At the contrast of the effect; unchanged if the vademecum does not cover it."""
+        """Return the vademecum at the contrast of the effect; unchanged if it does not cover it."""
         coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
         ranges = [(c.low, c.high) for c in coordinates if c.name == "contrast"]
         contrast = self.contrast

@@ -1,20 +1,20 @@
 """Viscoelasticity: a generalised Maxwell model at constant Poisson's ratio.
 
 With E(t) / E = g(t) = g_inf + sum_i g_i exp(-t / tau_i) the response separates in space and time
-(Christensen, Theory of Viscoelasticity, 1982): the loads f on the tissue are the relaxed loads e of
+(Christensen, Theory of Viscoelasticity, 1982). The loads f on the tissue are the relaxed loads e of
 an elastic organ with the same displacement,
 
-    f(t) = int g(t - t') de(t') = g_inf e + sum_i h_i,      u = C e,
+    f(t) = int g(t - t') de(t') = g_inf e + sum_i h_i,      u = C e.
 
-and exactly, for e linear in time over a period (Simo & Hughes, Computational Inelasticity, 10.3),
+For e linear in time over a period this is exact (Simo & Hughes, Computational Inelasticity, 10.3):
 
     h_i <- exp(-dt / tau_i) h_i + r_i (e_new - e),    r_i = g_i (tau_i / dt) (1 - exp(-dt / tau_i)),
 
-Within a period the organ therefore has the compliance C / A, A = g_inf + sum_i r_i, and its history
+Within a period the organ therefore has the compliance C / A, A = g_inf + sum_i r_i. Its history
 acts as the load -(sum_i exp(-dt / tau_i) h_i - e sum_i r_i) / A: tissue that was touched recovers
-slowly. For the modes of contact, e and h_i are stored as modal loads; for the near field and the
-modes of regions, as loads on the positions that were touched, at most ``MAX_HISTORY``, of which the
-weakest are dropped first.
+slowly. For the modes of contact, e and h_i are stored as modal loads. For the near field and the
+modes of regions they are loads on the positions that were touched. At most ``MAX_HISTORY`` loads
+are kept; the weakest are dropped first.
 """
 
 from __future__ import annotations
@@ -92,9 +92,11 @@ class Viscoelasticity(Effect):
 
     @classmethod
     def example(cls) -> Viscoelasticity:
+        """Return a relaxation to measure and test."""
         return cls((0.3, 0.25), (0.5, 8.0))
 
     def lay_out(self, ground: Ground) -> Any:
+        """Return the coefficients of a period."""
         g, tau, period = np.array(self.g, float), np.array(self.tau, float), ground.period
         ramp, rest = g * (tau / period) * -np.expm1(-period / tau), np.array([1.0 - g.sum()])
         return self.Constants(np.exp(-period / tau), ramp, rest, 1.0 / (rest + ramp.sum()))
@@ -102,7 +104,7 @@ class Viscoelasticity(Effect):
 
 @fast
 def predict_history(model, data):  # type: ignore[no-untyped-def]
-    """sum_i exp(-dt / tau_i) h_i - e sum_i r_i, of the modes, of the near field and of the tips."""
+    """Compute sum_i exp(-dt / tau_i) h_i - e sum_i r_i for modes, near field and tips."""
     memory, prony = data.viscoelasticity, model.viscoelasticity
     ramp = 0.0
     for i in range(prony.ramp.shape[0]):
@@ -125,13 +127,13 @@ def predict_history(model, data):  # type: ignore[no-untyped-def]
 
 @inlined
 def held_load(model, data, t):  # type: ignore[no-untyped-def]
-    """The load on a tip that would keep its dent as it is [N]."""
+    """Return the load on a tip that would keep its dent constant [N]."""
     return data.viscoelasticity.tip_held[t] if model.viscoelasticity.on else 0.0
 
 
 @fast
 def predict_modes(model, data):  # type: ignore[no-untyped-def]
-    """Modes at the end of the period without any load, and their gain, without inertia."""
+    """Predict modes at the end of the period without load, and their gain, without inertia."""
     superposition = data.superposition
     gain = model.viscoelasticity.gain[0]
     for k in range(superposition.free.shape[0]):
@@ -144,7 +146,7 @@ def predict_modes(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def near_free_displacement(model, data, t, near_free):  # type: ignore[no-untyped-def]
-    """Near displacement at the nodes of a tip by the load history, into (MAX_STENCIL, 3)."""
+    """Write near displacement at a tip's nodes by the load history, (MAX_STENCIL, 3)."""
     memory = data.viscoelasticity
     gain = model.viscoelasticity.gain[0]
     for i in range(data.n_nodes[t]):
@@ -197,8 +199,9 @@ def advance_history(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def _advance_tips(model, data):  # type: ignore[no-untyped-def]
-    """The history that each tip carries along; it ends with the contact. A bonded disc has none:
-    its dent is elastic, as fast contact is.
+    """Advance each tip's own history, which ends with the contact.
+
+    A bonded disc has no history: its dent is elastic, like fast contact.
     """
     memory, prony = data.viscoelasticity, model.viscoelasticity
     for t in range(memory.tip_held.shape[0]):
@@ -235,7 +238,7 @@ def _advance_near_history(model, data):  # type: ignore[no-untyped-def]
 
 @inlined
 def _slot_of(model, data, position):  # type: ignore[no-untyped-def]
-    """Slot of a load position in the near history, replacing the weakest if all are taken."""
+    """Return a load position's slot in the near history; replace the weakest if all are taken."""
     memory = data.viscoelasticity
     m = memory.slot[position]
     if m >= 0:
@@ -278,7 +281,7 @@ def _remove(model, data, m):  # type: ignore[no-untyped-def]
 
 @fast
 def least_shown(data):  # type: ignore[no-untyped-def]
-    """Load below which near history is left out of the cloud [N]."""
+    """Return the load below which near history is left out of the cloud [N]."""
     strongest = 0.0
     for m in range(data.viscoelasticity.count[0]):
         e = data.viscoelasticity.near_elastic[m]
