@@ -8,7 +8,7 @@ class AvatarError(Exception):
 
 
 def one_line(error: object, longest: int = 500) -> str:
-    """What an error or a text says, in one line of at most so many printable letters."""
+    """Return the text of an error in one line, of at most ``longest`` printable letters."""
     line = " ".join(str(error).split()) or type(error).__name__
     return "".join(letter if letter.isprintable() else "?" for letter in line[:longest])
 

@@ -1,3 +1,4 @@
-"""Errors of a vademecum. A vademecum and the finite element problem it was built from come in;
-relative errors on loads and contacts that the build never saw go out.
+"""Errors of a vademecum, relative, on loads and contacts that the build never saw.
+
+A vademecum and the finite element problem it was built from come in; errors go out.
 """

@@ -1,7 +1,7 @@
-"""The errors of an accuracy curve: of what a step shows and feels at unseen contacts.
+"""Errors of an accuracy curve: of a step's displacement and force at unseen contacts.
 
-A patch is pressed at drawn places by the compiled step itself, with its stencil and its smooth
-compliance, and compared with full finite elements of the same mesh: the force at the same depth,
+The compiled step itself presses a patch at drawn places, with its stencil and its smooth
+compliance. It is compared with full finite elements of the same mesh: the force at the same depth,
 the displacement under the same force.
 """
 
@@ -46,7 +46,7 @@ PATCH_TIP = Tip("patch", HEIGHTS[1] + 2e-3)  # in contact wherever a tip is draw
 
 
 def details_of(n_modes: int) -> tuple[Detail, ...]:
-    """Return the details that a curve is measured at: all combinations, and no cloud at all."""
+    """Return the details at which a curve is measured: all combinations, and no cloud at all."""
     shown = tuple(Detail(modes, cloud) for cloud in SHOWN for modes in mode_levels(n_modes))
     return (*shown, Detail(n_modes, "off"))
 
@@ -58,14 +58,13 @@ class StepErrors:
     Attributes
     ----------
     shown : ndarray, shape (n_details - 1, n)
-        Shown of the displacement that the step shows, at the force that it feels; no row for no
-        cloud.
+        Errors of the shown displacement under the step's force; no row for no cloud.
     force : ndarray, shape (n,)
-        Force of the force at the depth of the tip.
+        Errors of the force at the depth of the tip.
     smoothing : ndarray, shape (n,)
         Relative change of the compliance under a tip by smoothing.
     sizes : Sequence[int]
-        Sizes of what shows each detail [bytes].
+        Size of the data that show each detail [bytes].
     """
 
     shown: np.ndarray
@@ -81,8 +80,12 @@ def step_errors(
 
     Parameters
     ----------
+    vademecum : Vademecum
+    elasticity : Elasticity
+    n, seed : int
+        Number of contacts, and the seed that draws them.
     single : bool
-        These in single precision.
+        Solve the finite elements in single precision.
     """
     contacts, levels = draw_contacts(vademecum, n, seed), mode_levels(vademecum.n_modes)
     vademecum = _bare(vademecum)
@@ -112,13 +115,16 @@ def step_errors(
 
 
 def _bare(vademecum: Vademecum) -> Vademecum:
-    """As it is meshed, at small strain; the error that its steps say is the smoothing alone."""
+    """Return the vademecum with the meshed surface, at small strain.
+
+    The error that its steps estimate is the smoothing alone.
+    """
     said = replace(Certificate.unknown(), force_error=ForceError(1.0, 0.0))
     return replace(vademecum, certificate=said, display=None, large=None)
 
 
 def pressed(data: ContactData, tip: np.ndarray) -> float:
-    """Return the force of a patch at a place that it comes to from nowhere [N]."""
+    """Return the force of a patch that appears at a place without a path [N]."""
     data.reset()
     status = solve(data.model, data, tip[None])
     if status != Status.OK:
@@ -131,7 +137,7 @@ def _square(field: np.ndarray, volume: np.ndarray) -> float:
 
 
 def _size(arrays: Any, level: int) -> int:
-    """Return the bytes of the modes up to a level, of their core and of the loads."""
+    """Return the bytes of the modes up to a level, with their core and loads."""
     share = float(np.mean(arrays.level <= level)) if len(arrays.level) else 0.0
     modes = arrays.space.nbytes + arrays.core.nbytes + arrays.level.nbytes
     return round(share * modes) + arrays.regional_load.nbytes
@@ -144,9 +150,13 @@ def curve_of(
 
     Parameters
     ----------
-    shown : ndarray, shape (n_details - 1, n), relative errors of the displacement
-    force : ndarray, shape (n,), of the normal force
-    sizes : of each detail [bytes]
+    vademecum : Vademecum
+    shown : ndarray, shape (n_details - 1, n)
+        Relative errors of the displacement.
+    force : ndarray, shape (n,)
+        Relative errors of the normal force.
+    sizes : Sequence[int]
+        Size of each detail [bytes].
     """
     details = details_of(vademecum.n_modes)
     force_error = upper_quantile(force)

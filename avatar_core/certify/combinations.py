@@ -1,8 +1,8 @@
 """Large pushes together with other effects: the error of superposing them linearly.
 
 Only the response of a patch to its own normal force is nonlinear; oblique forces, other tips and
-preloads are superposed. Each is compared with full nonlinear finite elements under the same motion
-of the patch:
+preloads are superposed. Each combination is compared with full nonlinear finite elements under the
+same motion of the patch:
 
     oblique   30 degrees off the normal
     two tools 40 mm apart, pushed to the same depth together
@@ -38,14 +38,17 @@ class CombinedRow:
 
     Attributes
     ----------
+    combination : str
     site : int
-        Accessible face whose centroid is pushed; depth [m].
+        Accessible face whose centroid is pushed.
+    depth : float
+        Depth [m].
     contact : float
         |F - F_FE| / |F_FE|.
     linear_contact : float
-        The same of the linear vademecum.
+        The same error of the linear vademecum.
     within : bool
-        The push lies in the stored range.
+        Whether the push lies in the stored range.
     """
 
     combination: str
@@ -69,12 +72,16 @@ def push_errors(
 
     Parameters
     ----------
+    vademecum : Vademecum
+    problem : Hyperelasticity
     depths : Sequence[float]
-        Increasing [m].
+        Increasing depths [m].
+    n_sites, seed : int
+        Number of sites, and the seed that draws them.
     beyond : bool
-        Also where the vademecum says that a push leaves its stored range.
+        Whether to include pushes that the vademecum reports as beyond its stored range.
     progress : Callable[[float], None]
-        Called with the fraction that is done.
+        Called with the finished fraction.
     """
     rng = np.random.default_rng(seed)
     surface = vademecum.surface
@@ -95,14 +102,14 @@ def push_errors(
 
 
 def mean_error(rows: Sequence[CombinedRow], combination: str) -> float:
-    """Of the pushes within the stored range [-]; NaN: there are none."""
+    """Return the mean error of the pushes within the stored range [-]; NaN without pushes."""
     found = [row.contact for row in rows if row.combination == combination and row.within]
     return float(np.mean(found)) if found else float("nan")
 
 
 @dataclass(frozen=True, eq=False)
 class _DepthCurve:
-    """h(a) = sum_k beta_k a^k of a tip, tangential beyond its reach."""
+    """Added depth h(a) = sum_k beta_k a^k of a tip, tangential beyond its reach."""
 
     depth: FloatArray  # (2,) beta_k
     reach: float
@@ -115,11 +122,13 @@ class _DepthCurve:
 class _Combined:
     """Forces f that move their patches to d n = C f + s h(s gamma f), m of them.
 
-    loads : ndarray, shape (3 n_nodes, m), unit loads; motion : ndarray, shape (m,), n
+    loads : ndarray, shape (3 n_nodes, m), unit loads
+    motion : ndarray, shape (m,), n
     preload : ndarray, shape (3 n_nodes,), or None
     compliance : ndarray, shape (m, m), C
-    own : ndarray, shape (m,), gamma, of each tip along its normal; curves : h of each
-    normal_fraction : s, of the force that is normal
+    own : ndarray, shape (m,), gamma of each tip along its normal
+    curves : h of each tip
+    normal_fraction : s, the normal fraction of the force
     """
 
     loads: FloatArray
@@ -131,13 +140,13 @@ class _Combined:
     preload: FloatArray | None = None
 
     def motion_under(self, force: FloatArray) -> FloatArray:
-        """Return d n, of each patch along its load [m]."""
+        """Return d n of each patch along its load [m]."""
         a = self.normal_fraction * self.own * force
         added = [curve(x) for curve, x in zip(self.curves, a, strict=True)]
         return self.compliance @ force + self.normal_fraction * np.array(added)
 
     def forces(self, depth: float) -> FloatArray:
-        """Those that reach a depth, by Newton's method from the linear ones [N].
+        """Return the forces that reach a depth, by Newton's method from the linear ones [N].
 
         Raises ConvergenceError if it finds none.
         """
@@ -157,7 +166,7 @@ class _Combined:
         )
 
     def linear_forces(self, depth: float) -> FloatArray:
-        """Return the same of the linear vademecum."""
+        """Return the forces that reach a depth in the linear vademecum [N]."""
         return np.linalg.solve(self.compliance, depth * self.motion)
 
     def reaches(self, depth: float) -> bool:
@@ -180,7 +189,7 @@ class _Site:
         return vademecum.compliance(self.positions, self.weights, other.positions, other.weights)
 
     def depth_curve(self, vademecum: Vademecum) -> _DepthCurve:
-        """What large deformation adds to its depth."""
+        """Return the depth that large deformation adds."""
         large = vademecum.large
         assert large is not None
         reach = float(large.reach[self.positions].min())
@@ -202,7 +211,7 @@ def _at_site(
 
 
 def _oblique(v: Vademecum, site: _Site, angle: float) -> _Combined:
-    """Return a force 30 degrees off the inward normal moves its patch along itself."""
+    """Return a force 30 degrees off the inward normal, which moves its patch along itself."""
     across = np.linalg.svd(site.inward[None])[2][1:]
     sideways = np.cos(angle) * across[0] + np.sin(angle) * across[1]
     along = np.cos(OBLIQUE) * site.inward + np.sin(OBLIQUE) * sideways
@@ -233,7 +242,7 @@ def _two_tools(v: Vademecum, one: _Site, other: _Site) -> _Combined:
 
 
 def _gravity(v: Vademecum, problem: Hyperelasticity, site: _Site) -> _Combined:
-    """A push along the normal of an organ that already hangs from its clamp (to -y: supine)."""
+    """Return a push along the normal of an organ that hangs from its clamp (to -y: supine)."""
     weight = np.zeros((problem.n_nodes, 3))
     weight[: len(v.mesh.vertices), 1] = -DENSITY * GRAVITY * v.mesh.vertex_volumes
     gamma = np.array([[site.inward @ site.compliance(v, site) @ site.inward]])
@@ -265,7 +274,7 @@ def _states(
 
 
 def _row(name: str, site: int, combined: _Combined, state: State) -> CombinedRow:
-    """Return the vademecum beside a full equilibrium."""
+    """Compare the vademecum with a full equilibrium."""
     depth, truth = float(state.depth), state.force
     curved, linear = (
         float(np.linalg.norm(found - truth) / np.linalg.norm(truth))

@@ -1,10 +1,10 @@
 """Contacts of real tips against resolved ones, at some places of an organ.
 
-The step presses spheres of several radii to several depths; the truth is Signorini's contact of the
-same sphere in the same pose with the organ itself, on a mesh that resolves the contact and lies on
+The step presses spheres of several radii to several depths. The reference is Signorini's contact of
+the same sphere in the same pose with the organ itself. Its mesh resolves the contact and lies on
 the surface that was read (:mod:`avatar_core.offline.resolved_contact`).
 
-The error that the step says is e_patch + e_law. On an organ with resolved contacts, e_law is
+The step's error estimate is e_patch + e_law. On an organ with resolved contacts, e_law is
 multiplied by the factor with which e_patch + factor e_law covers nine in ten of them.
 """
 
@@ -55,8 +55,10 @@ class Site:
     ----------
     kind : str
         "drawn", "ridge", "hollow" or "edge".
-    point, normal : ndarray, shape (3,)
-        Point and normal [m], normal pointing out.
+    point : ndarray, shape (3,)
+        Point [m].
+    normal : ndarray, shape (3,)
+        Outward unit normal.
     kappa : float
         Mean curvature over ``ASIDE``, positive where convex [1/m].
     """
@@ -69,13 +71,22 @@ class Site:
 
 @dataclass(frozen=True)
 class SiteContact:
-    """One contact: a tip at a depth at a site; forces along that of the truth [N].
+    """One contact: a tip at a depth at a site; forces along the resolved force [N].
 
-    truth : of the resolved contact; force : of the step; angle : between the two [rad]
-    estimate : error of the force as it is said, of which law_estimate is the law's part
-    patch : of the vademecum's own patch; hertz : of a sphere on a flat half-space (Hertz 1882),
-    NaN of another tip
-    far_l2 : relative L2 error of the displacement more than 15 mm away
+    Attributes
+    ----------
+    truth, force : float
+        Forces of the resolved contact and of the step [N].
+    angle : float
+        Angle between both forces [rad].
+    estimate, law_estimate : float
+        Estimated relative error of the force, and the law's part of it.
+    patch : float
+        Force of the vademecum's own patch [N].
+    hertz : float
+        Force of a sphere on a flat half-space (Hertz 1882), NaN for another tip [N].
+    far_l2 : float
+        Relative L2 error of the displacement more than 15 mm away.
     """
 
     site: Site
@@ -99,9 +110,9 @@ class SiteContact:
 def with_contact_sites(
     vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int, progress: Progress = silent
 ) -> Vademecum:
-    """Return the vademecum, its certificate with the errors of resolved contacts at ``n`` places.
+    """Return the vademecum, its certificate with errors against resolved contacts at ``n`` places.
 
-    What could not be resolved is counted in a notice of the provenance.
+    A notice of the provenance counts the contacts that could not be resolved.
     """
     sites = draw_sites(vademecum, surface, n, seed)
     contacts, notices = contacts_at_sites(vademecum, surface, _reported(sites, progress))
@@ -127,9 +138,9 @@ def contacts_at_sites(
     tips: Sequence[Tip] = SPHERES,
     depths: Sequence[float] = DEPTHS,
 ) -> tuple[list[SiteContact], list[str]]:
-    """Return the contacts of all sites, and notices that count what is missing.
+    """Return the contacts of all sites, and notices that count missing ones.
 
-    Left out are places that the reference cannot resolve, and poses that the step refuses.
+    Places that the reference cannot resolve, and poses that the step refuses, are left out.
     """
     contacts: list[SiteContact] = []
     lost: list[str] = []
@@ -149,10 +160,11 @@ def contacts_at_sites(
 
 
 def law_factor(contacts: Sequence[SiteContact]) -> float:
-    """The least factor on the law's error with which ``PROMISED`` of the contacts are covered.
+    """Return the least factor on the law's error that covers ``PROMISED`` of the contacts.
 
-    By split conformal prediction, as in :mod:`avatar_core.vademecum.force_error`; at least
-    ``LEAST_FACTOR``, and 1 without any contact.
+    The factor comes from split conformal prediction, like in
+    :mod:`avatar_core.vademecum.force_error`. It is at least ``LEAST_FACTOR``, and 1 without any
+    contact.
     """
     if not contacts:
         return 1.0
@@ -164,7 +176,7 @@ def law_factor(contacts: Sequence[SiteContact]) -> float:
 
 
 def summarized(contacts: Sequence[SiteContact], factor: float = 1.0) -> ContactSites:
-    """Key figures of contacts, with the law's part of the error that is said times a factor."""
+    """Return key figures of contacts, with the law's part of the estimated error times a factor."""
     if not contacts:
         return ContactSites()
     error = np.array([contact.error for contact in contacts])
@@ -184,15 +196,17 @@ def summarized(contacts: Sequence[SiteContact], factor: float = 1.0) -> ContactS
 def draw_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) -> list[Site]:
     """Return places drawn evenly over the accessible surface; the last two a ridge and a hollow.
 
-    Not those at the border of the accessible surface, where the step's force fades on purpose: if
-    most of it is border, there may be fewer than ``n``.
+    Places at the border of the accessible surface, where the step's force fades on purpose, are
+    left out. If most of the surface is border, there may be fewer than ``n``.
 
     Parameters
     ----------
+    vademecum : Vademecum
     surface : SurfaceMesh
-        Surface that the vademecum was built of.
+        Surface that the vademecum was built from.
     n : int
-        n at least 3.
+        Number of places, at least 3.
+    seed : int
     """
     sites = _open_sites(vademecum, surface, max(DRAWN, 2 * n), seed)
     rest = sites[n - 2 :]
@@ -204,7 +218,10 @@ def draw_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) ->
 
 
 def edge_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) -> list[Site]:
-    """At most ``n`` places where the organ is thin, below ``THIN``; the thinnest of those drawn."""
+    """Return at most ``n`` of the drawn places where the organ is thinner than ``THIN``.
+
+    The thinnest places come first.
+    """
     sites = _open_sites(vademecum, surface, _MANY_DRAWN, seed)
     thick = np.array([_thickness(surface, site) for site in sites])
     order = np.argsort(thick)[:n]
@@ -212,7 +229,7 @@ def edge_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) ->
 
 
 def _open_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) -> list[Site]:
-    """Those of ``n`` places drawn evenly that a tip may press to the largest depth."""
+    """Return those of ``n`` evenly drawn places that a tip may press to the largest depth."""
     drawn = draw_contacts(vademecum, n, seed)
     sites = nearest_sites(vademecum, surface, drawn.place)
     return [site for site in sites if _access(vademecum, site) > OPEN]
@@ -254,7 +271,7 @@ def _access(vademecum: Vademecum, site: Site) -> float:
 
 
 class _Models(NamedTuple):
-    """The step of one tip, that of a patch in its place, and the tip."""
+    """The step of one tip, the step of a patch in its place, and the tip."""
 
     real: ContactData
     patch: ContactData
@@ -276,18 +293,23 @@ def compared(
 ) -> list[SiteContact]:
     """Return the contacts of several tips at one site.
 
+    A tip whose sides touch a hollow before it reaches the place is left out there.
+
     Parameters
     ----------
-    vademecum : linear, at its own material
-    models : of each tip
-    depths : of their lowest point below the surface [m]
-
-    A tip whose sides touch a hollow before it reaches the place is left out there.
+    vademecum : Vademecum
+        Linear, at its own material.
+    surface : SurfaceMesh
+    site : Site
+    models : Sequence[_Models]
+        Steps of each tip.
+    depths : Sequence[float]
+        Depths of the lowest points below the surface [m].
 
     Raises
     ------
     MeshError, ContactError, ConvergenceError
-        As :func:`avatar_core.offline.resolved_contact.contacts_at`.
+        See :func:`avatar_core.offline.resolved_contact.contacts_at`.
     """
     organ = (surface, vademecum.mesh, vademecum.regions, vademecum.material)
     tips = [model.tip for model in models]
@@ -334,13 +356,16 @@ def hertz_force(material: Material, radius: float, depth: np.ndarray | float) ->
 
 
 def _angle(force: np.ndarray, axis: np.ndarray) -> float:
-    """Between a force and a unit vector [rad]; NaN without a force."""
+    """Return the angle between a force and a unit vector [rad]; NaN without a force."""
     size = np.linalg.norm(force)
     return float(np.arccos(np.clip(force @ axis / size, -1.0, 1.0))) if size > 0.0 else np.nan
 
 
 def pressed(data: ContactData, site: Site, tip: Tip, depth: float) -> np.ndarray:
-    """The step's force at a depth below a site, after an approach along its normal, (3,) [N]."""
+    """Return the step's force at a depth below a site, after an approach along its normal [N].
+
+    The force has the shape (3,).
+    """
     data.reset()
     for at in (*np.arange(-0.5e-3, depth, 1e-3), depth):
         status = step(data.model, data, (site.point + (tip.offset - at) * site.normal)[None])

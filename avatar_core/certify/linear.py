@@ -1,8 +1,8 @@
 """Errors of a vademecum on unseen loads, and the cost of its build.
 
-The truth is the full finite element solution on the same mesh. Loads are patches centred at face
-centroids, which no part of the build uses, in three directions. What a step feels and shows is
-compared at contacts anywhere on the faces.
+The reference is the full finite element solution on the same mesh. Loads are patches centred at
+face centroids, which no part of the build uses, in three directions. The force and the displacement
+of a step are compared at contacts anywhere on the faces.
 """
 
 from __future__ import annotations
@@ -58,7 +58,9 @@ def certify(
 class UnseenErrors:
     """Relative errors; see :class:`Certificate`.
 
-    l2 (n, 3); contact, force (n,), of unseen loads; step, of as many unseen contacts
+    l2 : (n, 3), of unseen loads
+    contact, force : (n,), of unseen loads
+    step : errors of as many unseen contacts
     """
 
     l2: np.ndarray
@@ -80,7 +82,8 @@ def measured(
     Parameters
     ----------
     single : bool
-        Against solutions in single precision where that serves, which pays for many loads.
+        Whether the reference is solved in single precision where that is accurate enough, which
+        saves time for many loads.
     """
     surface = vademecum.surface
     single = single and _single_serves(vademecum, elasticity)
@@ -148,7 +151,7 @@ def certificate_of(vademecum: Vademecum, parts: Sequence[UnseenErrors], seed: in
 
 
 def _at_centroid(surface: LoadSurface, triangle: int) -> tuple[np.ndarray, np.ndarray]:
-    """Load positions and weights at the centroid of an accessible face."""
+    """Return load positions and weights at the centroid of an accessible face."""
     positions, weights = surface.weights(np.array([triangle]), np.full((1, 3), 1.0 / 3.0))
     return positions[0], weights[0]
 

@@ -31,14 +31,14 @@ MAX_DRAWS = 1000  # for one contact, on average; on livers most draws succeed
 class UnseenContacts:
     """Tips and the points that they touch, each (n, 3).
 
-    tip - phi n [m]; normal : n, that the step presses along
-
     Attributes
     ----------
-    tip : ndarray
+    tip : ndarray, shape (n, 3)
         Centre of the sphere [m].
-    place : ndarray
-        Place of the faces under its contact, the closest to.
+    place : ndarray, shape (n, 3)
+        Point of the faces under its contact, the closest to tip - phi n [m].
+    normal : ndarray, shape (n, 3)
+        Normal n, along which the step presses.
     """
 
     tip: np.ndarray
@@ -52,15 +52,17 @@ class UnseenContacts:
 
         Parameters
         ----------
+        surface : LoadSurface
+        elasticity : Elasticity
         single : bool
-            Solved in single precision.
+            Solve in single precision.
 
         Yields
         ------
-        compliance
+        compliance : float
             n . C n of a patch at the place [m/N].
         displacement : ndarray, shape (n_vertices, 3)
-            By its unit force along n [m/N].
+            Displacement by its unit force along n [m/N].
         """
         n = len(self.tip)
 
@@ -78,14 +80,14 @@ class UnseenContacts:
 
 
 def draw_contacts(vademecum: Vademecum, n: int, seed: int) -> UnseenContacts:
-    """Return the tips above points that are drawn evenly over the accessible faces.
+    """Return tips above points that are drawn evenly over the accessible faces.
 
     Each can come in along its normal: no other lobe of the organ hangs over it.
 
     Raises
     ------
     ConvergenceError
-        If a tip finds no such place in ``MAX_DRAWS`` random draws.
+        If a tip finds no free place in ``MAX_DRAWS`` random draws.
     """
     surface, field = vademecum.surface, vademecum.tip_field
     rng = np.random.default_rng(seed)

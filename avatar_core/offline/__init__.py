@@ -1,5 +1,5 @@
-"""The offline stage. A mesh, its elastic problem and the patches of its load surface come in, a
-vademecum goes out: solutions, separation by global and regional modes, over ranges of materials
-and large pushes too. It needs no step, and measures no error of its own
-(:mod:`avatar_core.certify`).
+"""The offline stage: from a mesh, its elastic problem and its load patches to a vademecum.
+
+It solves, and separates by global and regional modes, also over ranges of materials and for large
+pushes. It needs no step, and measures none of its own errors (:mod:`avatar_core.certify`).
 """

@@ -28,7 +28,7 @@ class FullResponse:
     columns : ndarray, shape (3 n_vertices, n_loads)
         Displacement at the vertices [m/N].
     compliance : ndarray, shape (n_loads, n_loads)
-        Compliance of patch under patch, symmetric [m/N].
+        Symmetric compliance between patches [m/N].
     norm : ndarray, shape (n_loads,)
         Mass-weighted L2 norm of each column [m^(5/2)/N].
     """
@@ -43,7 +43,7 @@ class FullResponse:
         return np.diagonal(self.compliance).astype(float)
 
     def remainder(self, far: SeparatedField, positions: np.ndarray) -> np.ndarray:
-        """What a field leaves of some positions' columns, shape (3 n_vertices, n, 3)."""
+        """Return positions' columns minus a field, shape (3 n_vertices, n, 3)."""
         loads = (3 * positions[:, None] + np.arange(3)).ravel()
         smooth = far.space.astype(np.float32) @ far.load[loads].T.astype(np.float32)
         return (self.columns[:, loads] - smooth).reshape(len(smooth), -1, 3)
@@ -63,13 +63,16 @@ class FullResponse:
 
 
 def full_response(elasticity: Elasticity, loads: sp.csr_matrix, progress: Progress) -> FullResponse:
-    """Solve for every load position, in single precision where that serves, on all cores.
+    """Solve for every load position, in single precision where it is accurate enough, on all cores.
 
-    Batches are the same whatever the number of cores, and so are the bits of their solutions.
+    Batches do not depend on the number of cores, nor do the bits of their solutions.
 
     Parameters
     ----------
-    loads : sparse, shape (3 n_nodes, n_loads), three for each position
+    elasticity : Elasticity
+    loads : sparse, shape (3 n_nodes, n_loads)
+        Three loads for each position.
+    progress : Progress
     """
     average, by_column, n = loads.T.tocsr(), loads.tocsc(), loads.shape[1]
     single = elasticity.single_serves(by_column)
@@ -94,7 +97,7 @@ def full_response(elasticity: Elasticity, loads: sp.csr_matrix, progress: Progre
 
 
 def _symmetrize(matrix: np.ndarray) -> None:
-    """(C + C^T) / 2 in place, by strips: rounding is all it removes (Maxwell-Betti)."""
+    """Replace C by (C + C^T) / 2 in place, by strips; only rounding changes (Maxwell-Betti)."""
     for k in range(0, len(matrix), 3 * _BATCH):
         strip = slice(k, k + 3 * _BATCH)
         mean = 0.5 * (matrix[k:, strip] + matrix[strip, k:].T)
@@ -115,18 +118,18 @@ def contact_blocks(response: FullResponse, surface: LoadSurface, support: float)
 def contact_near(
     exact: LocalBlocks, load: np.ndarray, surface: LoadSurface, support: float
 ) -> LocalBlocks:
-    """Return (C - Y Y^T), tapered up to a distance and exactly symmetric.
+    """Return C - Y Y^T, tapered up to a distance and exactly symmetric.
 
     exact : of :func:`contact_blocks`
     load : ndarray, shape (n_loads, rank), Y
-    support : [m]
+    support : distance [m]
     """
     distance = exact.distances(surface.centers)
     return _symmetrized(remainder(exact, load, taper(distance / support)))
 
 
 def remainder(exact: LocalBlocks, load: np.ndarray, fade: np.ndarray) -> LocalBlocks:
-    """Return (C - Y Y^T) of blocks of a compliance, times a factor of each block."""
+    """Return (C - Y Y^T) of blocks of a compliance, times a factor for each block."""
     load = load.reshape(len(load) // 3, 3, load.shape[1])
     block = np.empty(exact.block.shape, np.float32)
     for j in range(len(exact.start) - 1):
@@ -137,7 +140,7 @@ def remainder(exact: LocalBlocks, load: np.ndarray, fade: np.ndarray) -> LocalBl
 
 
 def _symmetrized(blocks: LocalBlocks) -> LocalBlocks:
-    """Return (B + B^T) / 2 block by block: rounding is all it removes (Maxwell-Betti)."""
+    """Return (B + B^T) / 2 block by block; only rounding changes (Maxwell-Betti)."""
     order = np.lexsort((blocks.position, blocks.target))  # the transpose, in the same pattern
     mean = 0.5 * (blocks.block + blocks.block[order].transpose(0, 2, 1))
     return replace(blocks, block=mean)

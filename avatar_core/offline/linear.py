@@ -1,12 +1,12 @@
 """The offline stage: from an organ's mesh to its vademecum.
 
-1. every patch is solved, in single precision where that serves;
-2. PGD finds the modes that all loads share, and body functions join them; an orthogonal mixing
-   sorts them by displacement norm. The first are the global modes of the displacement; the contact
-   compliance uses all of them;
-3. what the global modes leave is separated region by region of the load surface, in as many modes
-   as the tolerance asks for, and all modes together block by block of the mesh;
-4. what the modes leave of the contact compliance is kept near each load, tapered.
+1. Every patch is solved, in single precision where it is accurate enough.
+2. PGD finds modes common to all loads, and body functions join them. An orthogonal mixing sorts
+   them by displacement norm. The first are the global modes of the displacement; the contact
+   compliance uses all of them.
+3. The remaining displacement is separated region by region of the load surface, in as many modes as
+   the tolerance asks for. All modes together are separated block by block of the mesh.
+4. The remaining contact compliance is kept near each load, tapered.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def build_vademecum(
 ) -> Vademecum:
     """Compute the vademecum of one organ; see the module docstring for the stages.
 
-    A tolerance that is not met within ``max_modes`` still gives a complete vademecum, whose
+    If the tolerance is not met within ``max_modes``, the vademecum is still complete and its
     ``convergence.converged`` is False.
     """
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
@@ -146,11 +146,11 @@ def find_modes(
     n_modes: int,
     progress: Progress,
 ) -> Modes:
-    """Return the PGD in the energy norm of loads that are solved.
+    """Return the modes by PGD in the energy norm of loads that are solved.
 
-    Every load is divided by its own L2 norm, so that the relative error of a load at a stiff place
-    counts as much as that at a soft one. PGD of many loads works in single precision; its modes
-    are then solved and made orthonormal in double.
+    Every load is divided by its own L2 norm, so that a load at a stiff place counts as much as one
+    at a soft place. PGD of many loads works in single precision. Its modes are then solved and made
+    orthonormal in double precision.
     """
     weights = 1.0 / response.norm**2
     compliance = response.compliance
@@ -174,7 +174,7 @@ def find_modes(
 def _with_body(
     elasticity: Elasticity, loads: sp.csr_matrix, modes: Modes, n_global: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the first modes and after them the body's functions, which hold all of its sag.
+    """Return the first modes, then the body's functions, which hold all of its sag.
 
     Returns
     -------
@@ -201,7 +201,7 @@ def modes_of_regions(
     rule: BuildRule,
     progress: Progress = silent,
 ) -> tuple[list[RegionModes], tuple[RankError, ...]]:
-    """Modes of what the global ones leave, by regions; errors by numbers of modes at a place."""
+    """Return regional modes of the global modes' remainder, and errors by number of modes."""
     regions, errors = separate_regions(
         region,
         lambda positions: response.remainder(far, positions),

@@ -1,12 +1,12 @@
 """Offline stage of a vademecum with coordinates of material and supports.
 
-1. at every node of the coordinates all patches are solved, as for an ordinary vademecum, and PGD
-   finds the modes there;
-2. the modes of all nodes are compressed into one space basis (proper orthogonal decomposition
-   over nodes and loads), the functions of the body among its first;
-3. the stiffness is projected term by term; what the first functions leave of the displacement is
-   separated by regions, for all nodes together, and what the basis leaves of the contact compliance
-   is kept near the patch at every node.
+1. At every node of the coordinates all patches are solved, like for an ordinary vademecum, and PGD
+   finds the modes there.
+2. The modes of all nodes are compressed into one space basis (proper orthogonal decomposition over
+   nodes and loads). The functions of the body are among its first.
+3. The stiffness is projected term by term. The displacement beyond the first functions is separated
+   by regions, for all nodes together. The contact compliance beyond the basis is kept near the
+   patch at every node.
 
 The space basis serves every value in the range by a small Galerkin system.
 :mod:`avatar_core.reduction.coordinates` says why it is no canonical separated form.
@@ -68,7 +68,7 @@ _LEAST_SAG = 1e-3  # relative, of what is left of a unit sag, that gets a functi
 class _Snapshot:
     """The full solutions at one node, and the modes that PGD found there.
 
-    response : without its compliance, of which ``contact`` is what lies near [m/N]
+    response : without its compliance; ``contact`` holds the near part of it [m/N]
     modes : Modes, their space (3 n_nodes, n) in single precision
     sag : under unit weights along x, y and z, shape (3 n_nodes, 3)
     """
@@ -105,13 +105,14 @@ def build_parametric_vademecum(
 ) -> Vademecum:
     """Compute the vademecum of one organ over a range of materials and supports.
 
-    Its own fields are those at the values of ``elasticity``, moved into the ranges.
+    The vademecum's own fields are those at the values of ``elasticity``, moved into the ranges. For
+    the other parameters see :func:`avatar_core.offline.linear.build_vademecum`.
 
     Parameters
     ----------
     elasticity : Elasticity
-        Elasticity with an element that serves the whole range, and the inclusion if the contrast is
-        a coordinate.
+        Problem with an element for the whole range, and the inclusion if the contrast is a
+        coordinate.
     """
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
     nodes = node_values(coordinates)
@@ -139,7 +140,7 @@ def _solved(
     rule: BuildRule,
     progress: Progress,
 ) -> _Snapshot:
-    """Return all patches at one node, and the modes there."""
+    """Solve all patches at one node, and find the modes there."""
     half = 0.5
 
     def first(stage: str, fraction: float, error: float) -> None:
@@ -165,8 +166,8 @@ def _solved(
 def _principal(snapshots: Sequence[_Snapshot], rule: BuildRule) -> np.ndarray:
     """Return the principal space functions over all nodes and loads, shape (3 n_nodes, n).
 
-    With X the modes of all nodes side by side, X^T M X = A^T A, and Y block-diagonal with
-    Y^T W Y = B^T B, these are X B^T R for the leading R in A B^T = P S R^T.
+    X holds the modes of all nodes side by side, with X^T M X = A^T A, and Y is block-diagonal with
+    Y^T W Y = B^T B. The functions are X B^T R for the leading R in A B^T = P S R^T.
     """
     mesh = snapshots[0].elasticity.mesh
     space = np.hstack([snapshot.modes.space for snapshot in snapshots])
@@ -185,7 +186,7 @@ def _principal(snapshots: Sequence[_Snapshot], rule: BuildRule) -> np.ndarray:
 
 
 def _beside(space: np.ndarray, sags: np.ndarray, mass: np.ndarray) -> np.ndarray:
-    """Return functions of what a space leaves of sags, (3 n_nodes, n): surface loads hold 95 %."""
+    """Return functions of the sags beyond a space, (3 n_nodes, n); surface loads hold 95 %."""
     n = len(mass)  # vertices alone are weighted
     root = np.sqrt(mass)[:, None]
     sags = sags / np.linalg.norm(root * sags[:n], axis=0)
@@ -227,9 +228,9 @@ def _project(
 def _body_among_first(
     body: BodyResponse, sags: np.ndarray, n_global: int
 ) -> tuple[np.ndarray, int]:
-    """Return a rotation of a basis by which the functions of the body complete its first, (n, n).
+    """Return a rotation of a basis by which the body's functions complete its first, (n, n).
 
-    Returns the number of the first too, as some functions of the body may depend on others.
+    It also returns the number of the first functions, as some of the body's may depend on others.
     """
     identity = np.eye(len(body.mass))
     first = completed(body, sags, identity[:, : n_global - N_BODY])
@@ -251,7 +252,10 @@ def _assemble(
     snapshots: Sequence[_Snapshot],
     basis: GalerkinBasis,
 ) -> Vademecum:
-    """Regional modes of all nodes, near fields at each; the own fields are those of the first."""
+    """Assemble the vademecum: regional modes of all nodes, and near fields at each.
+
+    The vademecum's own fields are those of the first node.
+    """
     surface, elasticity = organ.surface, organ.elasticity
     roots = [stiffness_root(basis, s.elasticity.factors) for s in snapshots]
     fields = [galerkin_field(basis, root) for root in roots]
@@ -313,7 +317,7 @@ def _regions(
     region: np.ndarray,
     rule: RegionalRule,
 ) -> tuple[list[RegionModes], tuple[RankError, ...]]:
-    """Modes of what the global ones leave at all nodes, by regions; errors by modes at a place."""
+    """Return regional modes of the global modes' remainder at all nodes, and errors by modes."""
 
     def columns(positions: np.ndarray) -> np.ndarray:
         pairs = zip(snapshots, fields, strict=True)
@@ -338,12 +342,12 @@ def _separated(
     region: np.ndarray,
     regions: Sequence[RegionModes],
 ) -> tuple[BlockField, np.ndarray]:
-    """The field of the first functions of the basis and of the regional modes, for all nodes.
+    """Return the field of the basis's first functions and of the regional modes, for all nodes.
 
     Returns
     -------
-    field : its loads those of all nodes side by side
-    load : those in the regional modes alone, shape (n_nodes, n_positions, 3, most)
+    field : the field, with the loads of all nodes side by side
+    load : loads in the regional modes alone, shape (n_nodes, n_positions, 3, most)
     """
     n, n_positions = basis.n_global, len(region)
     amounts, motion = [], []
@@ -364,7 +368,7 @@ def _separated(
 
 
 def _errors(organ: _Organ, snapshots: Sequence[_Snapshot], field: BlockField) -> np.ndarray:
-    """Return relative L2 errors of a field, its loads those of all nodes, under each of them."""
+    """Return relative L2 errors of a field under each load, the loads of all nodes side by side."""
     mass, out = organ.elasticity.mesh.lumped_mass, []
     for k, snapshot in enumerate(snapshots):
         own = replace(field, load=field.load[:, 3 * k : 3 * k + 3])

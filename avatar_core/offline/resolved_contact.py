@@ -1,11 +1,12 @@
-"""Resolved contacts at one place of an organ: the forces an online law is judged against.
+"""Resolved contacts at one place of an organ: the reference forces for the online contact law.
 
-The organ's own mesh is refined around the place for the smallest and the largest contact at once,
-fitted there to the surface, factorized once, and condensed to what all tips together can reach.
+The organ's own mesh is refined around the place for the smallest and the largest contact at once.
+It is fitted there to the surface, factorized once, and condensed to the part that all tips together
+can reach.
 
-Balls are pressed in along the normal of the place, and stay where they are while the axis of their
-tractions is turned until it leads through the centre of pressure and that of the ball: without
-friction they take no moment. Beside a fold, that changed the force by up to a tenth.
+Balls are pressed in along the normal of the place. Their position stays, while the axis of their
+tractions is turned until it leads through the centre of pressure and the ball's centre: without
+friction a ball has no moment. Beside a fold, that changed the force by up to a tenth.
 """
 
 from __future__ import annotations
@@ -48,11 +49,11 @@ class Resolution:
     core : float
         Longest edge at the centre, over the radius of the smallest contact.
     inner : float
-        Its growth over the distance from the axis, up to the largest contact.
+        Growth of the longest edge over the distance from the axis, up to the largest contact.
     outer : float
         Its growth beyond and below.
     reach : float
-        Radius of the candidate surface over that of the contact on a half-space; a hollow place
+        Radius of the candidate surface over the contact radius on a half-space; a hollow place
         needs more than a flat one.
     """
 
@@ -64,18 +65,18 @@ class Resolution:
 
 @dataclass(frozen=True, eq=False)
 class ResolvedPlace:
-    """What tips feel at one place.
+    """Resolved contacts of tips at one place.
 
     Attributes
     ----------
     elasticity : Elasticity
-        The organ, refined there.
+        Problem of the organ, refined at the place.
     condensed : CondensedContact
-        Condensed of the tips one by one along the normal.
+        Condensed contact of the tips one by one along the normal.
     contacts : tuple[tuple[Contact, ...], ...]
-        Contacts[i][k] of tip i at depth k.
+        contacts[i][k] of tip i at depth k.
     axes : ndarray, shape (n_tips, n_depths, 3)
-        Along which their forces act, out of the organ.
+        Directions of their forces, out of the organ.
     """
 
     elasticity: Elasticity
@@ -85,7 +86,7 @@ class ResolvedPlace:
 
     @property
     def forces(self) -> np.ndarray:
-        """Along the axes, shape (n_tips, n_depths) [N]."""
+        """Forces along the axes, shape (n_tips, n_depths) [N]."""
         return np.array([[contact.forces[0] for contact in row] for row in self.contacts])
 
 
@@ -107,7 +108,7 @@ def contacts_at(
     Parameters
     ----------
     surface : SurfaceMesh or None
-        SurfaceMesh, to which the mesh is fitted around the place; None to keep its facets.
+        Surface to which the mesh is fitted around the place; None to keep its facets.
     mesh : TetMesh
         Mesh of the organ.
     regions : Regions
@@ -116,24 +117,22 @@ def contacts_at(
     place : ndarray, shape (3,)
         Place on the surface (or the facets), where depths are zero [m].
     normal : ndarray, shape (3,)
-        Pointing out; the direction in which tips are pushed in, reversed, and along which all but
-        balls press.
+        Outward normal. Tips are pushed in against it, and all tips but balls press along it.
     tips : Sequence[Tip]
-        Sequence of Tip.
     depths : Sequence[float]
         Depths of a tip's lowest point below the place [m].
     resolution : Resolution
     progress : Callable[[float], None] or None
         See :class:`avatar_core.fem.signorini.CondensedContact`.
     tumour : tuple[SurfaceMesh, float] or None
-        Its surface and the contrast of Young's moduli.
+        Surface of a tumour and the contrast of Young's moduli.
 
     Raises
     ------
     MeshError
         If the mesh would become too large, or cannot be fitted to the surface.
     ContactError, ConvergenceError
-        As :class:`avatar_core.fem.signorini.CondensedContact`.
+        See :class:`avatar_core.fem.signorini.CondensedContact`.
     """
     normal = np.asarray(normal, float) / np.linalg.norm(normal)
     elasticity = refined_organ(
@@ -185,8 +184,8 @@ def refined_organ(
 ) -> Elasticity:
     """Return the organ's elastic problem on a mesh that resolves contacts at some places.
 
-    Parameters as in :func:`contacts_at`, with shape (n, 3) for places and normals, on which all
-    tips and depths are expected.
+    For parameters see :func:`contacts_at`. Places and normals have the shape (n, 3); all tips and
+    depths are expected at each.
 
     Raises
     ------
@@ -210,7 +209,7 @@ def refined_organ(
 
 
 def _fitted(mesh: TetMesh, surface: SurfaceMesh, place: np.ndarray, largest: float) -> TetMesh:
-    """The mesh on the surface around a place: as far out as no tetrahedron turns inside out."""
+    """Return the mesh on the surface around a place, as far out as no tetrahedron inverts."""
     for factor in _FITTED[:-1]:
         try:
             return onto_surface(mesh, surface, place, factor * largest)

@@ -27,18 +27,18 @@ class BuildRule:
     Attributes
     ----------
     tolerance : float
-        Mean relative L2 error over the build's own loads; the worst load may have
-        ``worst_over_mean`` times it.
+        Mean relative L2 error over the build's own loads.
+    worst_over_mean : float
+        Allowed error of the worst load, over the tolerance.
     max_modes : int
-        Modes that show the displacement at a place at most: global ones, and those of the place's
-        region.
+        Largest number of modes that show the displacement at a place: global plus regional.
     global_modes : int
-        Global modes that all regions share, at most; and at most four in ten of ``max_modes``.
+        Largest number of global modes, common to all regions; at most 40 % of ``max_modes``.
     contact_modes : int
-        Contact modes of the contact compliance at most, the global ones among them.
+        Largest number of modes of the contact compliance, global modes included.
     region_area : float
-        Region area of the load surface for each region, in squared patch radii; a region has 30
-        load positions at least, in the mean.
+        Area of the load surface for each region, in squared patch radii. On average a region has at
+        least 30 load positions.
     contact_support : float
         Reach of the contact near field, in patch radii.
     """
@@ -53,12 +53,12 @@ class BuildRule:
 
     @property
     def n_global(self) -> int:
-        """Global modes."""
+        """Number of global modes."""
         return max(1, min(self.global_modes, round(_GLOBAL_PART * self.max_modes)))
 
     @property
     def regional(self) -> RegionalRule:
-        """How many modes a region gets beside the global ones."""
+        """Limits of a region's modes beside the global ones."""
         most = self.max_modes - self.n_global
         return RegionalRule(self.tolerance, self.worst_over_mean * self.tolerance, most)
 

@@ -1,10 +1,10 @@
 """Supports that a build is asked for: which part of a liver, how firmly, fixed or kept free.
 
-No stiffness per area of a liver's attachments was found in the literature: it is known that they
-matter more than the material, and they are fitted to a patient's motion (Nikolaev & Cotin,
-"Estimation of boundary conditions for patient-specific liver simulation during augmented surgery",
-IJCARS 15:1107, 2020; Mendizabal, Tagliabue & Dall'Alba, IJCARS 18:1295, 2023). The values of
-``TYPICAL`` are therefore guesses, from a layer of modulus E and thickness d, k = E / d:
+No stiffness per area of a liver's attachments was found in the literature. Attachments matter more
+than the material, and are fitted to a patient's motion (Nikolaev & Cotin, "Estimation of boundary
+conditions for patient-specific liver simulation during augmented surgery", IJCARS 15:1107, 2020;
+Mendizabal, Tagliabue & Dall'Alba, IJCARS 18:1295, 2023). The values of ``TYPICAL`` are therefore
+guesses, from a layer of modulus E and thickness d, k = E / d:
 
     cava_groove   a vein's wall, 0.62 MPa (Umale et al., J. Biomech. 44:1678, 2011), and a vein's
                   radius of 12 mm: 5e7
@@ -51,9 +51,9 @@ class SupportOption:
     name : str
         Name of an attachment by rule, or of a group of a file.
     stiffness : float
-        Per area [N/m^3]; infinity for a clamp.
+        Stiffness per area [N/m^3]; infinity for a clamp.
     coordinate : Coordinate or None
-        Its range, if it stays free; ``stiffness`` is where a vademecum begins.
+        Range of the stiffness, if it stays free; a vademecum begins at ``stiffness``.
 
     Raises
     ------
@@ -76,8 +76,9 @@ class SupportOption:
 
     @classmethod
     def parse(cls, text: str) -> SupportOption:
-        """``NAME``, ``NAME=STIFFNESS``, ``NAME=LOW:HIGH`` or ``NAME=clamped``, as on the command
-        line; a name alone is taken at its value of ``TYPICAL``.
+        """Parse ``NAME``, ``NAME=STIFFNESS``, ``NAME=LOW:HIGH`` or ``NAME=clamped``.
+
+        These are forms of the command line; a name alone takes its value of ``TYPICAL``.
         """
         name, _, value = (part.strip() for part in text.partition("="))
         if ":" in value:
@@ -105,7 +106,7 @@ class SupportOption:
 def held_by(
     mesh: TetMesh, options: Sequence[SupportOption], groups: Path | None = None
 ) -> tuple[Regions, tuple[Support, ...]]:
-    """Return :func:`held_at` the attachments by rule, and what a file of groups says."""
+    """Return the result of :func:`held_at` for the attachments by rule and a file of groups."""
     given = {} if groups is None else faces_of_groups(mesh, read_groups(groups))
     return held_at(mesh, options, attachments_by_rule(mesh) | given)
 
@@ -113,15 +114,17 @@ def held_by(
 def held_at(
     mesh: TetMesh, options: Sequence[SupportOption], places: Mapping[str, np.ndarray]
 ) -> tuple[Regions, tuple[Support, ...]]:
-    """The regions of an organ that supports hold instead of the usual clamp, and its supports.
+    """Return the regions of an organ held by supports instead of the clamp, and its supports.
 
-    Tools reach what looks forward and is not held, unless the places say otherwise.
+    Tools reach the faces that look forward and are not held, unless the places say otherwise.
 
     Parameters
     ----------
+    mesh : TetMesh
+    options : Sequence[SupportOption]
     places : Mapping[str, ndarray]
-        Faces of each support, ndarrays of bool, shape (n_faces,); of ``clamped`` and ``accessible``
-        too, if they are not left to the supports and the rule.
+        Faces of each support, ndarrays of bool, shape (n_faces,). Also ``clamped`` and
+        ``accessible``, unless they are left to the supports and the rule.
 
     Raises
     ------

@@ -1,5 +1,6 @@
-"""The computational vademecum itself. Separated fields come in; displacement and contact
-compliance at any place, load and material go out, with the certificate of their errors, the
-accuracy curve, and the HDF5 file that holds all of it: u(x, s) = global modes + those of the region
-of s.
+"""The computational vademecum: u(x, s) = global modes + modes of the region of s.
+
+Separated fields come in. Displacement and contact compliance at any place, load and material go
+out. A vademecum carries the certificate of its errors and the accuracy curve; one HDF5 file holds
+all of it.
 """

@@ -1,7 +1,7 @@
 """Accuracy against time: measured error and cost of contact steps, and the choice for a budget.
 
 A :class:`Detail` says how finely a step shows the displacement. An :class:`AccuracyCurve` holds the
-measured error and time of many, and :func:`choose` picks among them for a :class:`Budget`.
+measured error and time of many details, and :func:`choose` picks among them for a :class:`Budget`.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _CONFIDENCE = 0.95  # that it does, over draws of the loads that were measured
 
 @dataclass(frozen=True)
 class Detail:
-    """How finely a step shows the displacement.
+    """Resolution at which a step shows the displacement.
 
     Attributes
     ----------
     modes : int
-        Modes that move a point, in the mean over the points of the cloud, of those that the place's
-        region and its share of the global ones leave there; a vademecum's ``n_modes`` show all.
+        Mean number of modes used for one cloud point (global plus regional), e.g. `modes=7`; a
+        vademecum's ``n_modes`` uses all.
     cloud : Cloud
         Vertices that are shown.
     """
@@ -44,7 +44,7 @@ class Detail:
 
 
 def mode_levels(n_modes: int) -> tuple[int, ...]:
-    """Return the numbers of modes of the details of a curve, ascending, all at the end."""
+    """Return the numbers of modes of a curve's details, ascending; the last uses all."""
     return (*(level for level in LEVELS if level < n_modes), n_modes)
 
 
@@ -54,14 +54,16 @@ class CurvePoint:
 
     Attributes
     ----------
-    l2, force : float
-        Relative error that 95 % of unseen contacts stay below, of the displacement of the cloud
-        under the force that is felt, and of that force at the tip's depth; l2 is NaN where nothing
-        is shown.
-    p50, p99 : float
-        Time that a step takes of the processor [s]; NaN where it was not timed.
+    detail : Detail
+    l2 : float
+        Relative error of the cloud's displacement under the computed force, which 95 % of unseen
+        contacts stay below; NaN for no cloud.
+    force : float
+        Relative error of the force at the tip's depth, which 95 % of unseen contacts stay below.
     nbytes : int
-        Nbytes of all that is held to show the displacement; a step reads a part.
+        Size of all data that show the displacement [bytes]; a step reads a part.
+    p50, p99 : float
+        Processor time of a step, median and 99th percentile [s]; NaN where it was not timed.
     """
 
     detail: Detail
@@ -114,8 +116,9 @@ class AccuracyCurve:
 
     Attributes
     ----------
+    points : tuple[CurvePoint, ...]
     n_errors : int
-        Unseen contacts behind each error.
+        Number of unseen contacts behind each error.
     machine : str
         Machine where it was timed.
     """
@@ -125,16 +128,16 @@ class AccuracyCurve:
     machine: str = ""
 
     def of(self, cloud: Cloud) -> AccuracyCurve:
-        """Return the points of one cloud, of fewest modes first."""
+        """Return the points of one cloud, by ascending number of modes."""
         some = (point for point in self.points if point.detail.cloud == cloud)
         return replace(self, points=tuple(sorted(some, key=lambda p: p.detail.modes)))
 
     def up_to(self, modes: int) -> AccuracyCurve:
-        """Return the points of at most so many modes."""
+        """Return the points of at most this many modes."""
         return replace(self, points=tuple(p for p in self.points if p.detail.modes <= modes))
 
     def front(self, quantity: Quantity = "l2") -> tuple[CurvePoint, ...]:
-        """Return the points that none other beats in time and error (Pareto), fastest first."""
+        """Return the points that no other one beats in time and error (Pareto), fastest first."""
         best, front = np.inf, []
         for point in sorted(self.points, key=lambda p: (p.p50, p.error(quantity))):
             if point.error(quantity) < best:
@@ -143,7 +146,7 @@ class AccuracyCurve:
         return tuple(front)
 
     def plain(self) -> dict[str, Any]:
-        """As columns of numbers and text, for a file."""
+        """Return the curve as columns of numbers and text, for a file."""
         columns: dict[str, Any] = {
             name: [getattr(point.detail, name) for point in self.points] for name in _names(Detail)
         }
@@ -153,7 +156,7 @@ class AccuracyCurve:
 
     @staticmethod
     def of_plain(stored: dict[str, Any]) -> AccuracyCurve:
-        """Return the inverse of :meth:`plain`."""
+        """Return the curve of columns, the inverse of :meth:`plain`."""
 
         def rows(names: tuple[str, ...]) -> Iterable[tuple[Any, ...]]:
             return zip(*(stored[name] for name in names), strict=True)
@@ -168,16 +171,16 @@ def _names(kind: type) -> tuple[str, ...]:
 
 
 def choose(curve: AccuracyCurve | None, budget: Budget) -> CurvePoint:
-    """Return the fastest point that meets a budget; of equally fast ones the most accurate.
+    """Return the fastest point that meets a budget; among equally fast ones the most accurate.
 
     On a curve that was not timed, the fewest modes are the fastest. A looser tolerance is therefore
-    never slower, and a longer deadline never changes what is chosen, unless nothing met the shorter
-    one.
+    never slower. A longer deadline never changes the choice, unless nothing met the shorter one.
 
     Raises
     ------
     AccuracyError
-        If none does; the message names the nearest point on either side. Or if there is no curve.
+        If no point meets the budget; the message names the nearest point on either side. Also if
+        there is no curve.
     """
     if curve is None:
         raise AccuracyError(
@@ -219,11 +222,11 @@ def _first(
 
 
 def upper_quantile(values: np.ndarray, content: float = CONTENT) -> float:
-    """Return a bound that holds for a part ``content`` of what the values (n,) were drawn from.
+    """Return a bound that holds for a fraction ``content`` of the distribution of the values (n,).
 
     Distribution-free tolerance bound (Wilks, Annals of Mathematical Statistics 12, 1941): the
-    smallest order statistic x_(r) with P[B >= r] <= 1 - confidence, B binomial of n and
-    ``content``; the largest value where the sample is too small for the confidence.
+    smallest order statistic x_(r) with P[B >= r] <= 1 - confidence. B is binomial of n and
+    ``content``. If the sample is too small for the confidence, the bound is the largest value.
     """
     from scipy.stats import binom
 

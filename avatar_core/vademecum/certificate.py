@@ -15,21 +15,21 @@ class ContactSites:
     """Relative errors (fractions) of the force on real tips against resolved contacts.
 
     The contacts are those of spheres of several radii at several depths at some places of the
-    organ; :mod:`avatar_core.certify.contact_sites`.
+    organ; see :mod:`avatar_core.certify.contact_sites`.
 
     Attributes
     ----------
     n_contacts, n_places : int
-        Resolved; 0: not asked for.
+        Numbers of resolved contacts and places; 0: not asked for.
     mean, p95, worst : float
-        |F / F_resolved - 1| along the normal; p95 is that which 5 % exceed.
+        Mean, 95th percentile and maximum of |F / F_resolved - 1| along the normal.
     coverage : float
-        Part of the contacts whose error is at most the one that the step says.
+        Fraction of the contacts whose error is at most the step's estimate.
     overestimate : float
-        Median of the error that is said over the true one.
+        Median of the estimated error over the true one.
     factor : float
-        By which the law's part of the error that is said is multiplied, so that these contacts are
-        covered; 1 where there are none.
+        Factor on the law's part of the estimated error, by which these contacts are covered; 1
+        without contacts.
     """
 
     n_contacts: int = 0

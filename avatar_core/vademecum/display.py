@@ -1,15 +1,15 @@
-"""What is displayed of an organ: a surface finer than the mesh, and structures inside it.
+"""Displayed geometry of an organ: a surface finer than the mesh, and structures inside it.
 
-The mesh is as fine as its mechanics need, some millimetres; eyes want the organ as it was
-segmented, and its tumour in its place. A vertex x of the surface hangs on the
-nearest point of the mesh's boundary, one of a structure on the tetrahedron that holds it,
-sum_i w_i x_i, and moves with it,
+The mesh is as fine as its mechanics need, some millimetres. A display needs the organ as it was
+segmented, and its tumour in its place. A vertex x of the surface is attached to the nearest point
+of the mesh's boundary, a vertex of a structure to the tetrahedron that holds it, sum_i w_i x_i. It
+moves with it,
 
     u(x) = sum_i w_i u(x_i).
 
 Right under a tip, where the displacement is not linear over a triangle,
-:mod:`avatar_core.contact.display` interpolates only what is smooth. Modes are held at the mesh's
-vertices alone, so that neither the file nor the time of a step grows with modes times displayed
+:mod:`avatar_core.contact.display` interpolates only smooth fields. Modes are stored at the mesh's
+vertices alone. Neither the file nor the time of a step therefore grows with modes times displayed
 vertices.
 """
 
@@ -36,18 +36,18 @@ Triangles = tuple[np.ndarray, np.ndarray]  # vertices (n, 3) [m], faces (m, 3)
 
 @dataclass(frozen=True, eq=False)
 class Display:
-    """Displayed triangles at rest, part by part, and how they hang on the mesh.
+    """Displayed triangles at rest, part by part, and their attachment to the mesh.
 
     Attributes
     ----------
-    vertices : ndarray, shape (n, 3)
-        float32 [m].
+    vertices : ndarray of float32, shape (n, 3)
+        Vertices at rest [m].
     faces : ndarray of int32, shape (m, 3)
-        Counter-clockwise seen from outside.
+        Corners, counter-clockwise seen from outside.
     corners : ndarray of int32, shape (n, 4)
         Vertices of the mesh that carry each vertex.
-    weights : ndarray, shape (n, 4)
-        float32, of the corners; they add up to 1.
+    weights : ndarray of float32, shape (n, 4)
+        Weights of the corners; they add up to 1.
     first_face : ndarray of int64, shape (n_parts + 1,)
         First face of each part; vertices likewise follow each other.
     names : tuple[str, ...]
@@ -73,10 +73,11 @@ def organ_display(
 
     Parameters
     ----------
+    mesh : TetMesh
     surface : SurfaceMesh or None
-        Surface that the mesh was made of; None for the mesh's own boundary, refined.
+        Surface that the mesh was made from; None for the mesh's own boundary, refined.
     n : int
-        Vertices, about; 0 for those of the mesh.
+        Approximate number of vertices; 0 for those of the mesh.
     inside : Sequence[SurfaceMesh]
         Structures.
     """
@@ -107,19 +108,19 @@ def display_of(
 
 
 def _on_boundary(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As :func:`carriers`, but of the nearest points of the boundary."""
+    """Return the result of :func:`carriers` for the nearest points of the boundary."""
     faces = mesh.boundary_faces
     _, face, weights = closest_points(mesh.vertices, faces, np.asarray(points, float))
     return faces[face][:, [0, 1, 2, 0]], np.pad(weights, ((0, 0), (0, 1)))
 
 
 def blocks_to_display(mesh: TetMesh, display: Display | None) -> Blocks:
-    """Return the vertices of a mesh in blocks, of which the first hold what a display needs."""
+    """Return the vertices of a mesh in blocks; the first blocks hold those of the display."""
     return blocks_of(mesh.vertices, displayed_vertices(mesh, display))
 
 
 def displayed_vertices(mesh: TetMesh, display: Display | None) -> np.ndarray:
-    """Vertices of the mesh that are displayed, or that carry what is displayed, shape (n,)."""
+    """Return mesh vertices that are displayed, or that carry displayed ones, shape (n,)."""
     if display is None:
         return mesh.surface_vertices
     return np.union1d(mesh.surface_vertices, display.corners)
@@ -132,10 +133,10 @@ def boundary(mesh: TetMesh) -> Triangles:
 
 
 def outline(mesh: TetMesh, surface: SurfaceMesh | None, n: int) -> Triangles:
-    """Return the surface that a mesh was made of, with about n vertices.
+    """Return the surface that a mesh was made from, with about n vertices.
 
-    Without one, and where triangles of the file cross or do not close, the boundary of the mesh is
-    refined instead.
+    Without a surface, and where triangles of the file cross or do not close, the boundary of the
+    mesh is refined instead.
     """
     vertices, faces = boundary(mesh) if surface is None else unified(*surface.skin.boundary)
     if not is_manifold(faces):
@@ -144,9 +145,9 @@ def outline(mesh: TetMesh, surface: SurfaceMesh | None, n: int) -> Triangles:
 
 
 def structure(surface: SurfaceMesh) -> Triangles:
-    """Return a smooth surface inside an organ, such as that of a tumour, of the same volume.
+    """Return a smooth surface inside an organ, e.g. a tumour's, of the same volume.
 
-    A label map gives a lesion some hundred triangles; their edges would be seen.
+    A label map gives a lesion some hundred triangles, whose edges would be visible.
     """
     vertices, faces = unified(*surface.skin.boundary)
     n = min(max(len(vertices), FEWEST_OF_STRUCTURE), MOST_OF_STRUCTURE)

@@ -1,13 +1,13 @@
 """Error estimate of the force on a tip.
 
-The compliance that a contact step uses differs from the true one by smoothing, which varies from
-place to place and is known, and by the error of interpolation between load positions, taken as
-uniform. The estimate of the relative error at a place s is
+The compliance that a contact step uses differs from the true one in two ways. Smoothing varies from
+place to place and is known. The interpolation error between load positions is taken as uniform. The
+estimate of the relative error at a place s is
 
     e(s) = factor [ smoothing(s) + floor ],
 
-calibrated by split conformal prediction (Lei et al., JASA 113, 2018): ``factor`` is the quantile of
-|F / F_FE - 1| / [ smoothing + floor ] over unseen loads that covers the asked part of them.
+calibrated by split conformal prediction (Lei et al., JASA 113, 2018). ``factor`` is the quantile of
+|F / F_FE - 1| / [ smoothing + floor ] over unseen loads that covers the asked fraction of them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _WORST_OVER_MEAN = 2.06  # that 10 % of half-normal errors exceed
 
 @dataclass(frozen=True)
 class ForceError:
-    """The calibrated estimate; NaN: there is none."""
+    """Calibrated estimate of the force error; NaN: there is none."""
 
     factor: float = float("nan")
     floor: float = float("nan")
@@ -44,7 +44,7 @@ class ForceError:
 
 
 def calibrated(smoothing: np.ndarray, error: np.ndarray) -> ForceError:
-    """Factor and floor from unseen contacts, both (n,).
+    """Return factor and floor from unseen contacts, both (n,).
 
     The floor maximises the likelihood of exponentially distributed errors.
     """

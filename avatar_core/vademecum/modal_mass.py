@@ -6,7 +6,7 @@ along x, y and z, and the slowest modes of free vibration,
 
     K phi = omega^2 rho M phi,
 
-M the consistent mass of the same finite elements for a unit density.
+with M the consistent mass of the same finite elements for a unit density.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ class BodyResponse:
     weight: np.ndarray
 
     def mixed(self, mixing: np.ndarray) -> BodyResponse:
-        """Of the modes X A, A (rank, n)."""
+        """Return mass and weight in the modes X A, with A of shape (rank, n)."""
         return BodyResponse(mixing.T @ self.mass @ mixing, mixing.T @ self.weight)
 
 
 def body_response(elasticity: Elasticity, space: np.ndarray) -> BodyResponse:
-    """Of modes at all nodes, shape (3 n_nodes, rank)."""
+    """Return mass and weight in modes at all nodes, shape (3 n_nodes, rank)."""
     n = elasticity.n_nodes
     by_node = space.reshape(n, 3, -1)
     pushed = (elasticity.mass @ by_node.reshape(n, -1)).reshape(space.shape)
@@ -61,11 +61,13 @@ def body_response(elasticity: Elasticity, space: np.ndarray) -> BodyResponse:
 
 
 def body_functions(elasticity: Elasticity, space: np.ndarray) -> np.ndarray:
-    """Functions that complete K-orthonormal modes: K-orthonormal to them and among themselves.
+    """Return functions that complete K-orthonormal modes, K-orthonormal to them and one another.
 
     Parameters
     ----------
+    elasticity : Elasticity
     space : ndarray, shape (3 n_nodes, rank)
+        K-orthonormal modes.
 
     Returns
     -------
@@ -94,23 +96,23 @@ def body_functions(elasticity: Elasticity, space: np.ndarray) -> np.ndarray:
 
 
 def sag_of(elasticity: Elasticity) -> tuple[np.ndarray, np.ndarray]:
-    """Nodal forces of unit weights along x, y and z, and the sag under them, (3 n_nodes, 3)."""
+    """Return nodal forces of unit weights along x, y, z, and the sag under them, (3 n_nodes, 3)."""
     by_axis = np.asarray(elasticity.mass.sum(axis=1)).reshape(-1, 1, 1) * np.eye(3)
     weight = by_axis.reshape(-1, 3)
     return weight, elasticity.solve(weight)
 
 
 def principal_sags(sags: np.ndarray) -> np.ndarray:
-    """Few orthonormal functions that hold sags at several values, coefficients (n, n_sags)."""
+    """Return few orthonormal functions whose span holds some sags, coefficients (n, n_sags)."""
     vector, value, _ = np.linalg.svd(sags / np.linalg.norm(sags, axis=0), full_matrices=False)
     return np.asarray(vector[:, value > _SAME_SAG])
 
 
 def motion_beside(load: np.ndarray, body: BodyResponse | None) -> np.ndarray:
-    """Return amplitudes by which global modes may move beside the loads of the moment, (n, rank).
+    """Return amplitudes by which global modes may move beside the present loads, (n, rank).
 
-    A history may leave those of any load (3 n_positions, rank); each axis of the organ's weight
-    counts as much as all loads together.
+    A history may leave the amplitudes of any load (3 n_positions, rank). Each axis of the organ's
+    weight counts as much as all loads together.
     """
     if body is None:
         return load
@@ -119,7 +121,7 @@ def motion_beside(load: np.ndarray, body: BodyResponse | None) -> np.ndarray:
 
 
 def _vibrations(elasticity: Elasticity, mass: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray]:
-    """The slowest modes of free vibration (3 n_nodes, n) and their omega^2 at unit density."""
+    """Return the slowest vibration modes (3 n_nodes, n), and their omega^2 at unit density."""
     free = np.ones(mass.shape[0], bool)
     free.reshape(-1, 3)[elasticity.clamped_nodes] = False
     full = np.zeros((mass.shape[0], 1))
@@ -152,15 +154,16 @@ def completed(body: BodyResponse, sags: np.ndarray, kept: np.ndarray) -> np.ndar
     Parameters
     ----------
     body : BodyResponse
-        Body of the basis, n functions.
+        Mass and weight in the basis, n functions.
     sags : ndarray, shape (n, n_sags)
         Sags of the organ under its weight.
     kept : ndarray, shape (n, rank)
-        Orthonormal.
+        Orthonormal modes to be completed.
 
     Returns
     -------
-    ndarray, shape (n, rank + n_sags + N_VIBRATIONS or less), orthonormal, the first as given
+    ndarray, shape (n, rank + n_sags + N_VIBRATIONS or less)
+        Orthonormal columns, the first equal to ``kept``.
     """
     _, vibration = np.linalg.eigh((body.mass + body.mass.T) / 2.0)
     functions = np.hstack([sags, vibration[:, ::-1][:, :N_VIBRATIONS]])

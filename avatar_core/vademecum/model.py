@@ -1,11 +1,11 @@
 """The computational vademecum: an organ's precomputed response to a load anywhere on its surface.
 
-u(x, s) is one field, separated by regions of the load surface and by blocks of the organ, of global
-modes, which all loads share, and modes of the region that s lies in
-(:mod:`avatar_core.reduction.block_field`). The contact compliance C(s, s'), the patch-averaged
-displacement at s per patch force at s', is the Galerkin one of the global modes and further ones,
-Y Y^T, plus the exact remainder tapered to the neighbourhood: symmetric positive definite by
-construction, exact at the load positions themselves.
+u(x, s) is one field, separated by regions of the load surface and by blocks of the organ. It
+consists of global modes, common to all loads, and modes of the region that s lies in
+(:mod:`avatar_core.reduction.block_field`). The contact compliance C(s, s') is the patch-averaged
+displacement at s per patch force at s'. It is the Galerkin compliance Y Y^T of the global modes and
+further ones, plus the exact remainder tapered to the neighbourhood. It is symmetric positive
+definite by construction, and exact at the load positions themselves.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from avatar_core.vademecum.tip_field import TipField
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a vademecum comes from: enough to build it again.
+    """Origin of a vademecum: enough to build it again.
 
     Attributes
     ----------
     source : str
         File name of the surface, ``source_sha256`` its hash.
     unit, axes : str
-        As applied at the door.
+        Unit and axes applied on reading.
     versions : tuple[str, ...]
         "package version" of everything that took part.
     parameters : tuple[str, ...]
@@ -75,21 +75,21 @@ class RankError:
 
 @dataclass(frozen=True)
 class Convergence:
-    """How the modes were found.
+    """Record of the search for modes.
 
     Attributes
     ----------
     converged : bool
-        The tolerance was met within the mode limit.
+        Whether the tolerance was met within the mode limit.
     tolerance : float
-        Asked for, mean relative L2 error over the build's own loads.
+        Requested mean relative L2 error over the build's own loads.
     enrichments : tuple[EnrichmentReport, ...]
-        One report each.
+        One report for each enrichment.
     rank_errors : tuple[RankError, ...]
         Error against number of modes at a place.
     every_mean, every_worst : float
         Relative L2 error of the field under every load of the build, in three directions at each
-        position; NaN of a patient whose loads are not all solved.
+        position. NaN for a patient whose loads are not all solved.
     """
 
     converged: bool
@@ -100,7 +100,7 @@ class Convergence:
     every_worst: float = float("nan")
 
     def with_errors(self, errors: np.ndarray) -> Convergence:
-        """Return the same with the errors of the field, any shape."""
+        """Return the same record with the errors of the field, any shape."""
         return replace(self, every_mean=float(errors.mean()), every_worst=float(errors.max()))
 
 
@@ -111,7 +111,7 @@ class VademecumInfo:
     Attributes
     ----------
     force_mean, force_worst : float
-        Relative error at a depth, anywhere on the surface that tips feel.
+        Relative error at a depth, anywhere on the surface that tips reach.
     """
 
     id: str

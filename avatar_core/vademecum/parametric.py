@@ -4,14 +4,16 @@ Offline, one space basis V serves the whole range. Online, values p give the Gal
 
     A(p) = V^T K(p) V = sum_q theta_q(p) A_q = L L^T,     X = V L^-T,   Y(s) = L^-1 V^T f(s)
 
-which is K(p)-orthonormal as any far field of this project is, so that what remains of the contact
-compliance, C(p) - Y Y^T, is positive semi-definite. It is kept at the nodes of the range
-(:mod:`avatar_core.reduction.coordinates`) and combined with weights that are not negative: positive
-semi-definite again. The global modes are those of the first functions of the basis; what they leave
-is written in regional modes that serve the whole range: what the other functions hold of it
-follows from the Galerkin response, the small rest is combined from the nodes. Blocks are separated
-for the first functions and the regional modes, so that only the amounts depend on p. The result is
-an ordinary Vademecum, so that a step costs what it costs without coordinates.
+It is K(p)-orthonormal like any far field of this project. The remainder of the contact compliance,
+C(p) - Y Y^T, is therefore positive semi-definite. It is stored at the nodes of the range
+(:mod:`avatar_core.reduction.coordinates`) and combined with non-negative weights: positive
+semi-definite again.
+
+The global modes are those of the first functions of the basis. The remaining displacement is
+written in regional modes that serve the whole range. The other functions' part of it follows from
+the Galerkin response; the small rest is combined from the nodes. Blocks are separated for the first
+functions and the regional modes, so that only the amounts depend on p. The result is an ordinary
+Vademecum, so that a step costs the same as without coordinates.
 """
 
 from __future__ import annotations
@@ -34,16 +36,16 @@ class GalerkinBasis:
     Attributes
     ----------
     basis : SeparatedField
-        V at the vertices (3 n_vertices, n) and V^T f (3 n_positions, n), the functions of the body
-        after those of the global modes.
+        V at the vertices (3 n_vertices, n) and V^T f (3 n_positions, n). The functions of the body
+        follow those of the global modes.
     operators : ndarray, shape (n_terms, n, n)
         A_q of :attr:`Elasticity.factors`.
     n_global : int
-        Global modes of a vademecum at given values.
+        Number of global modes of a vademecum at given values.
     rank : int
-        Rank of its contact compliance, these among them.
+        Rank of its contact compliance, global modes included.
     body : BodyResponse or None
-        BodyResponse of the basis, or None.
+        Mass and weight in the basis.
     """
 
     basis: SeparatedField
@@ -60,17 +62,17 @@ class ParametricResponse(GalerkinBasis):
     Attributes
     ----------
     coordinates : tuple[Coordinate, ...]
-        Coordinates at least one.
+        One coordinate or more.
     projection : ndarray, shape (n_regions, most, n)
-        The functions of the basis in the modes of each region.
+        Functions of the basis in the modes of each region.
     regional_load : ndarray, shape (n_nodes, n_positions, 3, most)
-        What the basis leaves at the nodes, in the modes of each position's region.
+        Remainder of the basis at the nodes, in the modes of each position's region.
     core : ndarray, shape (n_block_modes, n_global)
         Core of the vademecum's field for the first functions of the basis.
     contact_near : ndarray, shape (n_nodes, n_blocks, 3, 3)
         Blocks at the nodes in the pattern of the vademecum's own near field.
     young_modulus : float
-        Young modulus that the blocks are computed for [Pa].
+        Young's modulus for which the blocks are computed [Pa].
     """
 
     coordinates: tuple[Coordinate, ...]
@@ -92,8 +94,8 @@ def galerkin_field(
 ) -> tuple[SeparatedField, np.ndarray, BodyResponse | None]:
     """Return the K(p)-orthonormal response in the space of the basis.
 
-    L is triangular: the global modes at p span the first functions of the basis whatever p is, so
-    that what they leave is a smooth function of p.
+    L is triangular. The global modes at p therefore span the first functions of the basis for every
+    p, so that the remainder is a smooth function of p.
 
     Parameters
     ----------
@@ -108,7 +110,7 @@ def galerkin_field(
     trailing : ndarray, shape (3 n_positions, rank - n_global)
         Load functions of further modes.
     body : BodyResponse or None
-        Body of the global modes; None for modes of surface loads alone.
+        Mass and weight in the global modes; None for modes of surface loads alone.
     """
     basis, body, n = found.basis, found.body, found.n_global
     load = galerkin_load(found, root)
@@ -121,7 +123,10 @@ def galerkin_field(
 
 
 def galerkin_load(found: GalerkinBasis, root: np.ndarray) -> np.ndarray:
-    """Return Y(s) of the contact compliance, shape (3 n_positions, rank); ``root`` as above."""
+    """Return Y(s) of the contact compliance, shape (3 n_positions, rank).
+
+    For the parameters see :func:`galerkin_field`.
+    """
     load = scipy.linalg.solve_triangular(root, found.basis.load.T, lower=True)
     return np.asarray(load[: found.rank].T)
 
@@ -133,16 +138,21 @@ def regional_load_of_basis(
     trailing: np.ndarray,
     region: np.ndarray,
 ) -> np.ndarray:
-    """The response beyond the global modes in the regional modes, (n_positions, 3, most) [m/N].
+    """Return the response beyond the global modes in the regional modes [m/N].
 
     Parameters
     ----------
-    projection : ndarray
-        Projection of the functions of the basis in the modes of each region.
+    found : GalerkinBasis
+    projection : ndarray, shape (n_regions, most, n)
+        Functions of the basis in the modes of each region.
     root, trailing : ndarray
-        Root and trailing of :func:`stiffness_root` and :func:`galerkin_field`.
-    region : ndarray
+        Results of :func:`stiffness_root` and :func:`galerkin_field`.
+    region : ndarray of int, shape (n_positions,)
         Region of each load position.
+
+    Returns
+    -------
+    ndarray of float32, shape (n_positions, 3, most)
     """
     n, rank = found.n_global, found.rank
     load = trailing.reshape(len(region), 3, rank - n).astype(np.float32)
@@ -156,16 +166,17 @@ def regional_load_of_basis(
 
 
 def field_at(field: BlockField, core: np.ndarray, root: np.ndarray, load: np.ndarray) -> BlockField:
-    """Return a field whose global modes are X = V L^-T at some values, of the one for V.
+    """Return a field with the global modes X = V L^-T at some values, from the field with V.
 
     Parameters
     ----------
+    field : BlockField
     core : ndarray
         Core of V.
     root : ndarray
         L of all functions.
-    load : ndarray
-        Amounts of X and of the regional modes, (n_positions, 3, most).
+    load : ndarray, shape (n_positions, 3, most)
+        Amounts of X and of the regional modes.
     """
     n = core.shape[1]
     inverse = scipy.linalg.solve_triangular(root[:n, :n], np.eye(n), lower=True)
@@ -174,6 +185,6 @@ def field_at(field: BlockField, core: np.ndarray, root: np.ndarray, load: np.nda
 
 
 def combined(at_nodes: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the values between the nodes, of values at them (n_nodes, ...)."""
+    """Return values between the nodes from values at them (n_nodes, ...)."""
     used = np.flatnonzero(weights)
     return np.asarray(np.tensordot(weights[used].astype(np.float32), at_nodes[used], 1))

@@ -199,7 +199,7 @@ def _require_surface(arrays: Arrays, sizes: Mapping[str, int]) -> None:
 
 
 def _require_display(arrays: Arrays, sizes: Mapping[str, int]) -> None:
-    """Vertices of an organ's size, hung within tetrahedra; faces in parts of one at least."""
+    """Require vertices of an organ's size, within tetrahedra; faces in parts of one at least."""
     _require_lengths(arrays, "display/vertices")
     require_indices("display/faces", arrays["display/faces"], sizes["displayed"])
     require_indices("display/corners", arrays["display/corners"], sizes["vertices"])
@@ -213,7 +213,7 @@ def _require_display(arrays: Arrays, sizes: Mapping[str, int]) -> None:
 
 
 def _require_blocks(arrays: Arrays, sizes: Mapping[str, int]) -> None:
-    """Blocks that hold each vertex once."""
+    """Require blocks that hold each vertex once."""
     vertex = arrays["blocks/vertex"].astype(np.int64)
     held = np.sort(vertex[vertex >= 0])
     if not np.array_equal(held, np.arange(sizes["vertices"])) or vertex.min() < -1:
@@ -223,7 +223,7 @@ def _require_blocks(arrays: Arrays, sizes: Mapping[str, int]) -> None:
 
 
 def _require_field(arrays: Arrays, name: str, n_shared: int) -> None:
-    """Regions that exist, of modes in order, none with more amplitudes than its loads have."""
+    """Require existing regions and ordered modes, with no more amplitudes than their loads."""
     count, start = (arrays[f"{name}/{key}"].astype(np.int64) for key in ("count", "start"))
     if len(count) < 2:
         raise StorageError(f"'{name}/count' names no region; build the file again")
@@ -238,7 +238,7 @@ def _require_field(arrays: Arrays, name: str, n_shared: int) -> None:
 
 
 def _require_rows(arrays: Arrays, name: str, n_rows: int, n_targets: int) -> None:
-    """Compressed rows of an upper half: ascending, from the first block to the last."""
+    """Require compressed rows of an upper half: ascending, from the first block to the last."""
     start, target = arrays[f"{name}/start"], arrays[f"{name}/target"]
     require_indices(f"{name}/target", target, n_targets)
     require_indices(f"{name}/start", start, len(target) + 1)

@@ -173,7 +173,7 @@ def parse_vademecum(content: bytes | memoryview, origin: str) -> Vademecum:
 
 
 def is_vademecum(path: str | Path) -> bool:
-    """Return whether a path is a regular HDF5 file of the format of vademecums; no more is read."""
+    """Return whether a path is a regular HDF5 file of a vademecum's format; no more is read."""
     return format_of(Path(path), MAX_FILE_BYTES) == FORMAT
 
 
@@ -188,10 +188,10 @@ def _read(source: BinaryIO, origin: str) -> Vademecum:
 
 
 def id_of(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
-    """Return SHA-256 of a file's content but for what a clock measured, 64 hexadecimal digits.
+    """Return SHA-256 of a file's content without measured times, 64 hexadecimal digits.
 
-    Left out are ``accuracy`` and the certificate's ``build_cpu_seconds``: two builds of one
-    organ differ in nothing else.
+    ``accuracy`` and the certificate's ``build_cpu_seconds`` are left out: two builds of one organ
+    differ in nothing else.
     """
     lasting = {key: value for key, value in attributes.items() if key != "accuracy"}
     certificate = json.loads(lasting["certificate"])
@@ -201,7 +201,7 @@ def id_of(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
 
 
 def _attributes_of(held: dict[str, str], origin: str) -> dict[str, str]:
-    """Return the attributes that count, of a file that is a vademecum of the present schema."""
+    """Return the attributes to verify, for a vademecum of the present schema."""
     if held.get("format") != FORMAT:
         raise StorageError(f"{origin} is HDF5 but no vademecum; build one with 'avatar vademecum'")
     require_schema(held, SCHEMA_VERSION, origin, "build it again with 'avatar vademecum'")
@@ -229,7 +229,7 @@ def _arrays(v: Vademecum) -> dict[str, np.ndarray]:
 
 
 def _upper_half(v: Vademecum) -> dict[str, np.ndarray]:
-    """Return the contact near field, as it is symmetric."""
+    """Return the upper half of the symmetric contact near field."""
     near, upper = v.contact_near, v.contact_near.is_upper
     count = np.bincount(near.position[upper], minlength=len(near.start) - 1)
     out = {
@@ -268,7 +268,7 @@ def _attributes(v: Vademecum) -> dict[str, str]:
 
 
 def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vademecum:
-    """Return the vademecum of arrays and attributes from elsewhere; all are checked first."""
+    """Return the vademecum from arrays and attributes of unknown origin; all are checked first."""
     require_sound(arrays)
     mirror = Mirror.of(arrays["contact_near/start"], arrays["contact_near/target"])
     plain = {key: parsed(attributes[key], key) for key in _JSON}
@@ -343,7 +343,7 @@ def _contrast(stored: Any) -> float | None:
 
 @dataclass(frozen=True)
 class _Support:
-    """What is stored of a support beside its faces."""
+    """Stored data of a support beside its faces."""
 
     name: str
     stiffness: float
@@ -382,7 +382,7 @@ def _certificate(stored: Any, curve: Any) -> Certificate | None:
 
 @dataclass(frozen=True)
 class _Curve:
-    """What AccuracyCurve.plain() gives."""
+    """Stored data of an accuracy curve, see AccuracyCurve.plain()."""
 
     modes: tuple[int, ...]
     cloud: tuple[Cloud, ...]
@@ -397,7 +397,7 @@ class _Curve:
 
 @dataclass(frozen=True)
 class _Large:
-    """What is stored of large deformation beside its arrays."""
+    """Stored data of large deformation beside its arrays."""
 
     material: LargeMaterial
     certificate: LargeCertificate | None

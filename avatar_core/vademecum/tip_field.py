@@ -1,22 +1,24 @@
 """The contact geometry of a tool tip: a smooth distance to the organ, and its access.
 
 phi(p) is the signed distance from p to the organ's outline, the surface that was read (negative
-inside); chi(p) is one where the closest point of the mesh is accessible and fades to zero beyond.
+inside). chi(p) is one where the closest point of the mesh is accessible and fades to zero beyond.
 Both are evaluated by quadratic B-splines over a grid, whose second derivatives are bounded: a force
-made of them never jumps.
+made from them is continuous.
 
-The coefficients of phi make the spline take the distance at every grid point, after the kernel
-2 G - G * G, G a Gaussian of half a spacing, has taken the shortest waves from it: interpolated,
-these overshoot at edges and folds. The kernel leaves planes and curved sides in place (its error is
-of fourth order). On eight livers with facets of 4 to 10 mm, phi at the outline has a root mean
-square of 0.02 to 0.04 mm, and 0.26 mm at worst, where a ball of 3 mm can follow the outline: touch
-it from either side and overlap it by less than 0.1 mm. Elsewhere it rounds edges over about two
+The coefficients of phi make the spline take the distance at every grid point, after a kernel has
+removed the shortest waves: interpolated, these overshoot at edges and folds. The kernel is 2 G - G
+* G, G a Gaussian of half a spacing. It leaves planes and curved sides in place (its error is of
+fourth order).
+
+On eight livers with facets of 4 to 10 mm, phi at the outline has a root mean square of 0.02 to 0.04
+mm, and 0.26 mm at worst. These hold where a ball of 3 mm can follow the outline: touch it from
+either side and overlap it by less than 0.1 mm. Elsewhere the field rounds edges over about two
 spacings, by up to 0.6 mm.
 
-Over a tumour, f(p) is the part of the energy under a tip that it stores; see
+Over a tumour, f(p) is the fraction of the energy under a tip that the tumour stores; see
 :mod:`avatar_core.geometry.tumour`. It is sampled where a tip may need it, within ``MARGIN`` of the
-outline and near the accessible faces; elsewhere its mean stands in. The outline itself stands
-beside: psi of any tip is made of it (:mod:`avatar_core.contact.tip_shift`).
+outline and near the accessible faces; elsewhere its mean is used. The outline itself is kept too:
+the shape factor of any tip is computed from it (:mod:`avatar_core.tips.shape_factor`).
 """
 
 from __future__ import annotations
@@ -74,17 +76,17 @@ def make_tip_field(
 ) -> TipField:
     """Sample phi and chi around the accessible surface.
 
-    Inside the organ, the distance is taken to the outline within the fading distance of the
-    accessible faces, so that a push into a thin lobe does not come out at its back.
+    Inside the organ, only the outline within the fading distance of the accessible faces counts. A
+    push into a thin lobe therefore does not come out at its back.
 
     Parameters
     ----------
-    mesh, regions : TetMesh
+    mesh, regions : TetMesh, Regions
         The organ.
     patch_radius : float
         R [m].
     outline : SurfaceMesh or None
-        The surface of which the mesh was made; None for the mesh's own boundary.
+        The surface that the mesh was made from; None for the mesh's own boundary.
 
     Raises
     ------
@@ -112,7 +114,7 @@ def make_tip_field(
 
 
 def with_tumour(field: TipField, tumour: SurfaceMesh, patch_radius: float) -> TipField:
-    """Return the same with f over a tumour, of a vademecum with that patch radius [m]."""
+    """Return the field with f over a tumour, for a vademecum with that patch radius [m]."""
     spacing = float(field.spacing[0])
     known, normals = _around(field.distance, field.access)
     points = field.origin + spacing * np.argwhere(known) - field.distance[known][:, None] * normals
@@ -126,10 +128,12 @@ def with_tumour(field: TipField, tumour: SurfaceMesh, patch_radius: float) -> Ti
 
 
 def _sampled(sample: Callable[[np.ndarray], np.ndarray], shape: np.ndarray) -> np.ndarray:
-    """Distance and access on a grid, (2, nx, ny, nz): at every other point along each axis, and at
-    all points within ``MARGIN`` of the outline; between the others interpolated.
+    """Return distance and access on a grid, (2, nx, ny, nz).
 
-    sample : both (2, n) at grid points of index (n, 3)
+    They are sampled at every other point along each axis, and at all points within ``MARGIN`` of
+    the outline; elsewhere they are interpolated.
+
+    sample : function that returns both (2, n) at grid points of index (n, 3)
     shape : three odd numbers
     """
     coarse = shape // 2 + 1
@@ -143,12 +147,12 @@ def _sampled(sample: Callable[[np.ndarray], np.ndarray], shape: np.ndarray) -> n
 
 
 def _deepened(distance: np.ndarray) -> np.ndarray:
-    """The distance, inside the organ replaced by the depth below the side that a tip came through.
+    """Return the distance, inside the organ the depth below the side that a tip came through.
 
     The closest point of a ridge is on one of its flanks, which is nearer than the side a tip was
-    pushed into. That side is where the way out along the normal of a wide kernel ends, and the
-    depth below it is the way times the cosine between its normal and the way. Within a spacing of
-    the outline the distance passes into that depth, so that the outline stays where it is.
+    pushed into. To find that side, follow the normal of a wide kernel out of the organ. The depth
+    is the length of this way times the cosine between the side's normal and the way. Within a
+    spacing of the outline the distance passes into that depth, so that the outline stays in place.
     """
     wide = gaussian_filter(distance, DEEP_SMOOTHING, mode="nearest")
     way = np.moveaxis(grid_normals(wide, SPACING), -1, 0)
@@ -172,7 +176,7 @@ def _deepened(distance: np.ndarray) -> np.ndarray:
 
 
 def _around(distance: np.ndarray, access: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where a tip may need to know the surface next to it, a mask of the grid; normals there."""
+    """Return the grid points where a tip may need the surface next to it, and normals there."""
     known = (np.abs(distance) < MARGIN) & (maximum_filter(access, size=5) > 0.0)
     normals = grid_normals(distance, SPACING)
     known &= np.linalg.norm(normals, axis=-1) > 0.5
@@ -180,14 +184,14 @@ def _around(distance: np.ndarray, access: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _shared(closest: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One of the points with nearly the same place and direction, and to which one each belongs."""
+    """Return points that differ in place or direction, and the number of each point's own."""
     key = np.hstack([np.round(closest / SHARED[0]), np.round(normals / SHARED[1])])
     _, first, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
     return first, group.ravel()
 
 
 def _near(triangles: Soup, mesh: TetMesh, regions: Regions, fade: float) -> Soup:
-    """The part of a surface over the accessible faces, or less than the fading distance off."""
+    """Return the surface over the accessible faces, or within the fading distance of them."""
     vertices, faces = _split(triangles, max(fade, SPACING))
     center, own = vertices[faces].mean(axis=1), (mesh.vertices, mesh.boundary_faces)
     over = regions.accessible[_closest(own, center)[1]]
@@ -207,7 +211,7 @@ def _access(mesh: TetMesh, regions: Regions, fade: float, points: np.ndarray) ->
 
 
 def _distance(skin: Skin, near: Soup, points: np.ndarray) -> np.ndarray:
-    """Distance to the skin, inside the organ to the part of it that is near, then negative."""
+    """Return the distance to the skin; inside the organ, minus the distance to its near part."""
     inside = skin.contains(points)
     distance = np.empty(len(points))
     distance[~inside] = _closest(skin.boundary, points[~inside])[0]
@@ -216,7 +220,7 @@ def _distance(skin: Skin, near: Soup, points: np.ndarray) -> np.ndarray:
 
 
 def _split(triangles: Soup, longest: float) -> Soup:
-    """The same surface of triangles without edges longer than that: each is cut into four."""
+    """Return the surface with no edge longer than ``longest``: triangles are cut into four."""
     corner = triangles[0][triangles[1]]
     done = []
     while len(corner):
@@ -238,7 +242,7 @@ def grid_normals(distance: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def _derivative(values: np.ndarray, along: int) -> np.ndarray:
-    """Of the splines along an axis at the grid points [grid spacings]."""
+    """Return the splines' derivative along an axis at the grid points [1 / spacing]."""
     out = values.astype(float)
     for axis in range(3):
         out = correlate1d(out, [-0.5, 0.0, 0.5] if axis == along else [0.125, 0.75, 0.125], axis)
@@ -248,7 +252,7 @@ def _derivative(values: np.ndarray, along: int) -> np.ndarray:
 def smoothed(values: np.ndarray, deviation: float, known: np.ndarray | None = None) -> np.ndarray:
     """Return 2 G f - G G f on a grid, G a Gaussian of some standard deviation [grid spacings].
 
-    Where not all grid points are ``known``, their mean stands in for the others.
+    Unknown grid points take the mean of those that are ``known``.
     """
     if known is None:
         once = gaussian_filter(values, deviation, mode="nearest")
