@@ -44,8 +44,8 @@ class Gram:
     Attributes
     ----------
     origin : ndarray, shape (D,)
-        The mean of the first members, which keeps the products and their rounding small; it does
-        not move when the base grows.
+        Mean of the first members, which keeps the products and their rounding small. It does not
+        move when the base grows.
     products : ndarray, shape (n, n)
         G_ij = (X_i - o) . (X_j - o).
     """
@@ -68,7 +68,7 @@ class Gram:
 
     @property
     def squared_lengths(self) -> FloatArray:
-        """|X_i - o|^2, shape (n,)."""
+        """Squared lengths |X_i - o|^2, shape (n,)."""
         return np.diag(self.products)
 
     def squared_distances(self, rows: IntArray) -> FloatArray:
@@ -95,11 +95,11 @@ class Dimension:
     gap : float
         Ratio of the two eigenvalues at the gap; near 1 the spectrum shows no dimension.
     from_local_pca : int
-        Principal components for 99 % of the variance of a neighbourhood, median.
+        Median number of principal components for 99 % of a neighbourhood's variance.
     eigenvalues : ndarray
-        The lowest of M, ascending.
+        Lowest eigenvalues of M, ascending.
     local_variances : ndarray, shape (k - 1,)
-        Mean fraction of the variance, descending.
+        Mean fraction of the variance along each principal axis, descending.
     """
 
     from_gap: int
@@ -115,7 +115,7 @@ class Dimension:
 
     @property
     def notices(self) -> tuple[str, ...]:
-        """Why the estimates should not be trusted, one line each."""
+        """Reasons to distrust the estimates, one line each."""
         lines = []
         if self.gap < CLEAR_GAP:
             lines.append(

@@ -104,7 +104,10 @@ def at_values(
 
 
 def ranges(here: Valued, parametric: ParametricResponse | None) -> dict[str, tuple[float, float]]:
-    """See :attr:`avatar_core.vademecum.model.Vademecum.ranges`."""
+    """Return the lowest and highest value of each coordinate, by name, if no other is changed.
+
+    "young" is included only if supports limit it.
+    """
     coordinates = parametric.coordinates if parametric else ()
     out = {c.name: (c.low, c.high) for c in coordinates}
     young, least, most = here.material.young_modulus, 0.0, math.inf
@@ -142,7 +145,7 @@ def _require_in_range(
 
 
 def _with_young_modulus(here: Valued, material: Material) -> Valued:
-    """Everything that is a compliance, times E / E'."""
+    """Return the vademecum with every compliance multiplied by E / E'."""
     softer = here.material.young_modulus / material.young_modulus
     if softer == 1.0:
         return replace(here, material=material)
