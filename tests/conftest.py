@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-# Before numpy: where tests run side by side, one thread each.
+# before numpy: where tests run side by side, one thread each
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("RAYON_NUM_THREADS", "1")
@@ -41,8 +41,8 @@ from tests.helpers.paths import SHARED
 from tests.helpers.slowest_files import SlowestFiles
 from tests.helpers.timing_turns import Turns
 
-# Compiling makes millions of objects that live on: looked through less often, it takes a seventh
-# less.
+# compiling makes millions of objects that live on: with rarer collections it takes a
+# seventh less time
 gc.set_threshold(100_000, 50, 1000)
 
 
@@ -59,10 +59,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="session", autouse=True)
 def made_once() -> Iterator[None]:
-    """Compiled code, meshes, contact geometry and responses of one organ, whatever asks for them.
+    """Make compiled code, meshes, contact geometry and responses once for each organ.
 
     Imports never run back (tests/core/test_rooms.py): contact geometry comes from no later room.
-    Models of an organ get copies of their own of its response.
+    Models of an organ get their own copies of its response.
     """
     rooms = ("common", "geometry", "fem", "reduction", "shapes", "vademecum", "contact")
     felt = on_disk(make_tip_field, rooms=rooms)
@@ -96,13 +96,13 @@ def phantom() -> SurfaceMesh:
 
 @pytest.fixture(scope="session")
 def straight() -> Vademecum:
-    """A coarse phantom with wide patches: few load positions."""
+    """Build a coarse phantom with wide patches: few load positions."""
     return _straight()
 
 
 @pytest.fixture(scope="session")
 def bent() -> Vademecum:
-    """The same under large pushes."""
+    """Build the coarse phantom under large pushes."""
     return _bent()
 
 
@@ -127,7 +127,7 @@ def _bent() -> Vademecum:
 
 
 def _of_surface(surface: SurfaceMesh, edge: float) -> tuple[Any, ...]:
-    """What a mesh is made of."""
+    """Return the arguments that a mesh depends on."""
     return surface.vertices, surface.faces, edge
 
 

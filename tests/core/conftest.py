@@ -19,7 +19,7 @@ from avatar_core.vademecum.model import Vademecum
 from tests.helpers.disk_cache import cached_on_disk
 from tests.helpers.elastic_shapes import box_mesh, box_regions
 
-_FIGURE = "figure"  # property of a test's report: those cross from a worker's process
+_FIGURE = "figure"  # property of a test's report, which crosses from a worker's process
 
 Box = Callable[[int], tuple[TetMesh, Regions]]
 Command = Callable[..., tuple[int, str, str]]
@@ -27,7 +27,7 @@ Command = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture(scope="session")
 def box() -> Box:
-    """Builds a box of n^3 cubes and its regions."""
+    """Build a box of n^3 cubes and its regions."""
 
     def build(n: int) -> tuple[TetMesh, Regions]:
         mesh = box_mesh(n)
@@ -65,7 +65,7 @@ def _phantom_vademecum() -> Vademecum:
     return build(phantom_liver(), options)
 
 
-REAL = ("LiTS-60", "Amos-007", "LiTS-23")  # of two sources; one cracked, one easily loses a lobe
+REAL = ("LiTS-60", "Amos-007", "LiTS-23")  # from two sources; one cracked, one easily loses a lobe
 
 
 @cached_on_disk
@@ -83,7 +83,7 @@ def real_vademecum(request: pytest.FixtureRequest, livers_dir: Path) -> Vademecu
 
 @pytest.fixture
 def figure(request: pytest.FixtureRequest) -> Callable[[str], None]:
-    """Reports what a case came to, beside its name."""
+    """Report a figure of a case beside its name."""
     name = f"{request.path.stem.removeprefix('test_')}: {request.node.name.removeprefix('test_')}"
 
     def report(value: str) -> None:
@@ -94,7 +94,7 @@ def figure(request: pytest.FixtureRequest) -> Callable[[str], None]:
 
 @pytest.fixture
 def avatar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
-    """Runs the command: exit code, output and errors."""
+    """Run the command; return exit code, output and errors."""
 
     def call(*words: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["avatar", *map(str, words)])

@@ -1,4 +1,4 @@
-"""The README and the pages of msg_docs: links that lead somewhere, headings in order, HTML."""
+"""The README and the pages of msg_docs: valid links, headings in order, HTML."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ PAGES = sorted(page for page in DOCS.rglob("*.md") if page.name != "index.md")  
 
 
 def prose(page: Path) -> str:
-    """A page without its blocks of code."""
+    """Return a page without its blocks of code."""
     return re.sub(r"^[ ]*```.*?^[ ]*```$", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
 
 
 def headings(page: Path) -> list[tuple[int, str]]:
-    """Level and text of each heading."""
+    """Return level and text of each heading."""
     return [(len(a), b) for a, b in re.findall(r"^(#+) (.+)$", prose(page), re.MULTILINE)]
 
 
 def anchors(page: Path) -> set[str]:
-    """The anchors that GitHub gives to the headings of a page."""
+    """Return the anchors that GitHub gives to the headings of a page."""
     kept = (re.sub(r"[^\w\- ]", "", text).strip() for _, text in headings(page))
     return {text.lower().replace(" ", "-") for text in kept}
 
 
 def links(page: Path) -> list[tuple[Path, str]]:
-    """File and anchor of each link inside the repository."""
+    """Return file and anchor of each link inside the repository."""
     found = re.findall(r"\]\((?!https?:)([^)#\s]*)#?([^)\s]*)\)", prose(page))
     return [((page.parent / path).resolve() if path else page, anchor) for path, anchor in found]
 

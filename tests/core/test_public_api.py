@@ -1,4 +1,4 @@
-"""The public API: what a notebook imports, and the lines of the README, run as they stand there."""
+"""The public API: imports of a notebook, and the lines of the README, run as they stand."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 def test_a_budget_chooses_what_is_shown_and_leaves_the_force(phantom_vademecum: Vademecum) -> None:
     """The tolerance of a coarser point of the certified curve: fewer modes, the same force.
 
-    By times of a microsecond for each mode, whatever else the machine did that took them.
+    Each mode counts as a microsecond, so that the machine's load does not matter.
     """
     certificate = phantom_vademecum.certificate
     assert certificate is not None and certificate.curve is not None
@@ -93,7 +93,7 @@ def press(model: av.ContactModel, vademecum: Vademecum) -> Sequence[float]:
 
 @cached_on_disk
 def built(n_vertices: int, n_certified: int) -> Vademecum:
-    """The built-in liver by the options that the README gives."""
+    """Build the built-in liver with the README's options."""
     options = av.OrganOptions(n_vertices=n_vertices, n_certified=n_certified)
     return pipeline.build(av.phantom_liver(), options)
 
@@ -102,10 +102,10 @@ def built(n_vertices: int, n_certified: int) -> Vademecum:
 def test_the_lines_of_the_readme_give_the_numbers_beside_them(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Each ``# -> number`` is what its line prints, to 2 %."""
+    """Each ``# -> number`` equals the output of its line, to 2 %."""
 
     def build(surface: SurfaceMesh, options: av.OrganOptions) -> Vademecum:
-        """As it was built in an earlier run of the same code."""
+        """Return a build of an earlier run of the same code."""
         found, sizes = av.phantom_liver(), (options.n_vertices, options.n_certified)
         assert np.array_equal(surface.vertices, found.vertices)
         assert options == av.OrganOptions(n_vertices=sizes[0], n_certified=sizes[1])

@@ -26,7 +26,7 @@ ORDER = {
         "vademecum",
         "tips",
         "registration",
-        "offline",  # which knows no step
+        "offline",  # knows no step
         "contact",
         "haptics",
         "certify",
@@ -65,7 +65,7 @@ ORDER = {
         "settings",
     ),
 }
-GENERATED = {"msg", "srv", "action"}  # of avatar_ros, by rosidl
+GENERATED = {"msg", "srv", "action"}  # generated in avatar_ros by rosidl
 FREE_OF_ROS = ("avatar_ros", "rclpy", "rcl_interfaces", "ament_index_python", "launch")
 FOLDERS = {"avatar_core": CORE, "avatar_ros": NODES, "avatar_ros.ui": NODES / "ui"}
 
@@ -76,7 +76,7 @@ def module_name(file: Path, package: str) -> str:
 
 
 def imported(file: Path) -> Iterator[str]:
-    """Everything a file imports, inside functions and for type checkers too."""
+    """Return everything a file imports, inside functions and for type checkers too."""
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -85,7 +85,7 @@ def imported(file: Path) -> Iterator[str]:
 
 
 def imports_of(package: str) -> dict[str, set[str]]:
-    """For each module of a package, the modules of the same package that it imports."""
+    """Return for each module of a package the modules of the same package that it imports."""
     files = {module_name(f, package): f for f in sorted(FOLDERS[package].rglob("*.py"))}
     found = {}
     for module, file in files.items():

@@ -20,22 +20,22 @@ import pytest
 from tests.helpers.disk_cache import cached_on_disk
 from tests.helpers.slowness import Deadline, slowness
 
-_DOMAINS = range(1, 102)  # of DDS, those that work on every platform
+_DOMAINS = range(1, 102)  # DDS domain ids that work on every platform
 TIP_RADIUS = 0.005  # [m]
-# Of a contact node: a test may be kept from sending poses for longer than a driver.
+# for a contact node: a test may pause its poses for longer than a driver
 PATIENT = ["--ros-args", "-p", "pose_timeout:=0.5"]
-START_TIMEOUT = 120.0  # of a process, its compilation included, on a busy machine [s]
-DISCOVERY = 0.3  # of a client by its service [s]
-JOINING = 5.0  # after which a node that joined is taken to have missed something [s]
-ASK_AGAIN = 2.0  # after which an answer is taken for lost [s]
+START_TIMEOUT = 120.0  # for a process to start, with compilation, on a busy machine [s]
+DISCOVERY = 0.3  # for a client to be discovered by its service [s]
+JOINING = 5.0  # time after which a node that joined counts as having missed something [s]
+ASK_AGAIN = 2.0  # time after which an answer counts as lost [s]
 TOUCH_DEPTH = 0.004  # [m]
 
 
 def until_calm(longest: float = 2.0) -> None:
     """Wait until no thread of the middleware is at work in this process.
 
-    The end of a participant that is just being told of another one waits forever (Fast DDS, issue
-    6513), the more likely the busier the machine is.
+    If a participant ends while it is told of another one, it waits forever (Fast DDS, issue 6513).
+    This is more likely on a busy machine.
     """
     end = time.monotonic() + longest
     while _at_work() and time.monotonic() < end:
@@ -44,7 +44,7 @@ def until_calm(longest: float = 2.0) -> None:
 
 def _at_work() -> bool:
     for task in Path("/proc/self/task").iterdir():
-        with suppress(OSError):  # it ended meanwhile
+        with suppress(OSError):  # it has ended
             name, _, rest = (task / "stat").read_text().rpartition(")")
             if "(dds." in name and rest.split()[0] == "R":
                 return True
@@ -52,7 +52,7 @@ def _at_work() -> bool:
 
 
 class Probe:
-    """A node in the test's own process that listens and asks."""
+    """Node in the test's own process that listens and asks."""
 
     def __init__(self) -> None:
         import rclpy
@@ -93,7 +93,7 @@ class Probe:
         timeout: float = START_TIMEOUT,
         meanwhile: Callable[[], None] = lambda: None,
     ) -> Any:
-        """The next message that is ``wanted``; ``meanwhile`` is called while waiting."""
+        """Return the next message that is ``wanted``; call ``meanwhile`` while waiting."""
         found: list[Any] = []
         subscription = self.node.create_subscription(
             kind, topic, lambda message: found.append(message) if wanted(message) else None, qos
@@ -109,14 +109,14 @@ class Probe:
         return found[0]
 
     def call(self, kind: type, name: str, request: Any) -> Any:
-        """The answer to a request that may change something: it is sent once."""
+        """Return the answer to a request that may change something: it is sent once."""
         client = self.client(kind, name)
         answer = client.call_async(request)
         self.until(answer.done, START_TIMEOUT)
         return answer.result()
 
     def ask(self, kind: type, name: str, request: Any) -> Any:
-        """The answer to a question: it is asked again as long as no answer came."""
+        """Return the answer to a question: it is asked again as long as no answer came."""
         client, asked = self.client(kind, name), []
         passed = Deadline(START_TIMEOUT)
         while not passed:
@@ -128,11 +128,12 @@ class Probe:
         raise AssertionError(f"{name} did not answer within {START_TIMEOUT:g} s")
 
     def client(self, kind: type, name: str) -> Any:
-        """A client whose service is there and had the time to discover it in turn.
+        """Return a client whose service is there and had the time to discover the client.
 
         A service drops the answer to a client that it has not discovered within 100 ms
-        (rmw_fastrtps, issue 842); clients are kept, so that this is waited for once, and the
-        longer the more processes there are for a core.
+        (rmw_fastrtps, issue 842). Clients are kept, so that this wait happens once; it grows with
+        the
+        number of processes per core.
         """
         if (kind, name) not in self._clients:
             client = self._clients[kind, name] = self.node.create_client(kind, name)
@@ -146,9 +147,9 @@ class Probe:
 
 @contextmanager
 def newcomer(knows: Callable[[Any], bool]) -> Iterator[Probe]:
-    """A probe whose node discovered what it has to know; if none does, the last that joined.
+    """Make a probe whose node discovered what it must know; if none does, the last that joined.
 
-    One that joins may miss for good what another node said of itself: then one more joins.
+    A node that joins may miss another node's announcements for good: then one more joins.
     """
     passed = Deadline(START_TIMEOUT)
     while True:
@@ -156,7 +157,7 @@ def newcomer(knows: Callable[[Any], bool]) -> Iterator[Probe]:
             patience = JOINING * slowness()
             probe.until(lambda probe=probe: knows(probe.node), patience, fail=False)
             if knows(probe.node) or passed:
-                probe.spin(DISCOVERY)  # what is there beyond that, a test should see, too
+                probe.spin(DISCOVERY)  # a test should see the rest too
                 yield probe
                 return
 
@@ -175,7 +176,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
-    """Run alone without ROS, none of these tests is collected."""
+    """Accept that none of these tests is collected when they run alone without ROS."""
     if exitstatus == pytest.ExitCode.NO_TESTS_COLLECTED and IS_MISSING:
         session.exitstatus = pytest.ExitCode.OK
 
@@ -187,7 +188,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 @contextmanager
 def free_domain() -> Iterator[int]:
-    """A DDS domain that no other worker or run of these tests on this machine has meanwhile."""
+    """Reserve a DDS domain that no other worker or run of these tests on this machine uses."""
     first = os.getpid() % len(_DOMAINS)
     for number in (*_DOMAINS[first:], *_DOMAINS[:first]):
         with ExitStack() as held:
@@ -195,7 +196,7 @@ def free_domain() -> Iterator[int]:
                 path = Path(tempfile.gettempdir(), f"avatar-tests-domain-{number}.lock")
                 lock = held.enter_context(path.open("w"))
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except (BlockingIOError, PermissionError):  # another user's, the latter
+            except (BlockingIOError, PermissionError):  # PermissionError: another user's
                 continue
             yield number
             return
@@ -204,9 +205,9 @@ def free_domain() -> Iterator[int]:
 
 @pytest.fixture(scope="session", autouse=True)
 def own_domain() -> Iterator[dict[str, str]]:
-    """No other cell on this machine or network hears these tests, nor they it.
+    """Isolate these tests from other cells on this machine or network.
 
-    A cell that is measured here takes this domain, too, and none at random.
+    A measured cell uses this domain too, not a random one.
     """
     from avatar_ros.bench import cell
 
@@ -219,7 +220,7 @@ def own_domain() -> Iterator[dict[str, str]]:
 
 @pytest.fixture(scope="session")
 def organ() -> Any:
-    """A coarse phantom's vademecum: what matters here is not how exact it is."""
+    """Build a coarse phantom's vademecum, for tests that need no accuracy."""
     return _organ()
 
 
@@ -237,7 +238,7 @@ def _organ() -> Any:
 
 @pytest.fixture(scope="session")
 def library(organ: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Good and bad files, the same organ by another name, and a way out."""
+    """Fill a library: good and bad files, the same organ by another name, and a link out."""
     from avatar_core.vademecum.storage import save_vademecum
 
     folder = tmp_path_factory.mktemp("library")
@@ -256,12 +257,12 @@ def library(organ: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-N_ATLAS = 3  # anatomies
+N_ATLAS = 3  # number of anatomies
 
 
 @pytest.fixture(scope="session")
 def livers() -> list[Any]:
-    """Surfaces of the atlas, and one more."""
+    """Return the surfaces of the atlas, and one more."""
     return _livers()
 
 
@@ -275,7 +276,7 @@ def _livers() -> list[Any]:
 
 @cached_on_disk
 def _patients() -> dict[str, bytes]:
-    """The livers as files, and an atlas of all but the last; what matters is not how exact."""
+    """Return the livers as files, and an atlas of all but the last, without need of accuracy."""
     from avatar_core.atlas.growth import AtlasOptions, SurfaceFile, create_atlas
     from avatar_core.atlas.response import ResponseSolver
     from avatar_core.atlas.workers import Workers
@@ -309,7 +310,7 @@ def _patients() -> dict[str, bytes]:
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A library with surfaces, good and bad, and an atlas of all but the last one."""
+    """Fill a library with surfaces, good and bad, and an atlas of all but the last one."""
     from avatar_core.common.hdf5 import replace_file
 
     folder = tmp_path_factory.mktemp("patients")
@@ -334,7 +335,7 @@ def probe(own_domain: dict[str, str]) -> Iterator[Probe]:
 
 @pytest.fixture(scope="module")
 def lasting_probe(own_domain: dict[str, str]) -> Iterator[Probe]:
-    """For many short questions: a new node takes a second or more to find the others."""
+    """Make a probe for many short questions: a new node takes a second or more to find others."""
     probe = Probe()
     yield probe
     probe.close()
@@ -342,7 +343,7 @@ def lasting_probe(own_domain: dict[str, str]) -> Iterator[Probe]:
 
 @pytest.fixture(scope="module")
 def cell(own_domain: dict[str, str], library: Path) -> Iterator[dict[str, Any]]:
-    """Loader and contact node, as a user starts them, for one module of tests."""
+    """Start loader and contact node as a user does, for one module of tests."""
     from avatar_ros.bench.cell import Module
 
     files = ["-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"]
@@ -357,7 +358,7 @@ def cell(own_domain: dict[str, str], library: Path) -> Iterator[dict[str, Any]]:
 
 @pytest.fixture(scope="session")
 def touch(organ: Any) -> tuple[np.ndarray, np.ndarray]:
-    """A tip 4 mm deep in the middle of the accessible surface, and the outward normal there."""
+    """Return a tip 4 mm deep in the middle of the accessible surface, and the outward normal."""
     from avatar_core.contact.tool_path import middle_of_access
 
     j = middle_of_access(organ)
@@ -367,7 +368,7 @@ def touch(organ: Any) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture
 def bench(organ: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Makes contact loops that the test steps, see ``SteppedLoop``."""
+    """Make contact loops that the test steps, see ``SteppedLoop``."""
     from tests.ros.helpers.stepped_loop import stepped_loops
 
     with stepped_loops(organ, monkeypatch) as make:

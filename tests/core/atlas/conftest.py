@@ -65,7 +65,7 @@ def atlas(folder: Path) -> Atlas:
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Names of the surfaces that were registered."""
+    """Record the names of the surfaces that are registered."""
     names: list[str] = []
     register = atlas_build.register
 
@@ -79,7 +79,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @pytest.fixture
 def avatar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
-    """Runs ``avatar`` in this process."""
+    """Run ``avatar`` in this process."""
 
     def command(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["avatar", *map(str, arguments)])

@@ -19,7 +19,7 @@ from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.registration import RegistrationRule, Template
 
-# a rough registration, 0.3 s instead of 6 s: what an atlas does with it is the same
+# a rough registration, 0.3 s instead of 6 s: the atlas treats it alike
 ROUGH = RegistrationRule(
     n_stages=5, last_sweeps=0, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
 )
@@ -48,7 +48,7 @@ def write_obj(path: Path, surface: SurfaceMesh) -> Path:
 
 
 def written(folder: Path, frame: Frame, members: Sequence[WholeAnatomy]) -> Atlas:
-    """An atlas on disk, as `create_atlas` with the same options begins and fills it."""
+    """Write an atlas to disk, as `create_atlas` with the same options begins and fills it."""
     folder.mkdir()
     save_frame(folder, frame, _hash_of_options(OPTIONS, frame.template))
     for member in members:
@@ -57,7 +57,7 @@ def written(folder: Path, frame: Frame, members: Sequence[WholeAnatomy]) -> Atla
 
 
 def same(one: Atlas, other: Atlas) -> bool:
-    """Whether two atlases hold the same, bit for bit."""
+    """Return whether two atlases hold the same, bit for bit."""
     return one.names == other.names and all(
         np.array_equal(one.vectors[i], other.vectors[i])
         and np.array_equal(a.registered, b.registered)
@@ -68,7 +68,7 @@ def same(one: Atlas, other: Atlas) -> bool:
 
 
 def files_of(folder: Path) -> dict[str, tuple[int, bytes]]:
-    """Time of writing and content of every file of an atlas."""
+    """Return time of writing and content of every file of an atlas."""
     return {
         str(file.relative_to(folder)): (file.stat().st_mtime_ns, file.read_bytes())
         for file in sorted(folder.rglob("*"))
@@ -77,7 +77,7 @@ def files_of(folder: Path) -> dict[str, tuple[int, bytes]]:
 
 
 class StopError(Exception):
-    """What interrupts a build in these tests."""
+    """Exception that interrupts a build in these tests."""
 
 
 def stop_after(n: int) -> Callable[[int, int, str], None]:

@@ -1,4 +1,4 @@
-"""avatar atlas: create, add, show, go on, refuse."""
+"""avatar atlas: create, add, show, continue, refuse."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.core.atlas.rough import ROUGH, Command, files_of, write_obj
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, avatar: Command, template: Template) -> Command:
-    """Runs ``avatar atlas`` with a small template and a rough registration."""
+    """Run ``avatar atlas`` with a small template and a rough registration."""
     monkeypatch.setattr(atlas_build, "default_template", lambda n: template)
     monkeypatch.setattr(atlas_build, "AtlasOptions", partial(AtlasOptions, rule=ROUGH))
     return partial(avatar, "atlas")

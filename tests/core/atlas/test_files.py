@@ -1,4 +1,4 @@
-"""A file that was changed, cut or is of another kind is refused."""
+"""Files of an atlas that were changed, cut or replaced are refused."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.core.atlas.rough import written
 
 @pytest.fixture
 def copy(folder: Path, tmp_path: Path) -> Path:
-    """An atlas to spoil."""
+    """Copy an atlas, to damage it."""
     return Path(shutil.copytree(folder, tmp_path / "atlas"))
 
 
@@ -107,7 +107,7 @@ def test_arrays_that_do_not_fit_are_refused(
             {name: spoil(a) if name == key else a for name, a in arrays.items()}, *others
         )
 
-    monkeypatch.setattr(hdf5, "encoded", spoiled)  # with a checksum that is right
+    monkeypatch.setattr(hdf5, "encoded", spoiled)  # with a correct checksum
     with pytest.raises(AvatarError, match=r"again|atlas|surface"):
         written(tmp_path / "atlas", frame, members[:1])
         read_all(tmp_path / "atlas")

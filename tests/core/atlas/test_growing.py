@@ -1,4 +1,4 @@
-"""An atlas grows without forgetting, counts what is the same once, and says what is too large."""
+"""An atlas grows without forgetting, counts duplicates once, and names too large organs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.core.atlas.rough import ALONE, OPTIONS, files_of, same, write_obj, wr
 
 
 def grid_of(atlas: Atlas, vector: np.ndarray) -> DistanceGrid:
-    """A distance vector as a grid on the box."""
+    """Return a distance vector as a grid on the box."""
     box = atlas.frame.box
     return DistanceGrid(np.array(box.origin), box.spacing, vector.reshape(box.shape))
 
@@ -64,7 +64,7 @@ def test_a_surface_that_is_there_is_not_built_again(
     calls: list[str],
     tmp_path: Path,
 ) -> None:
-    """A stream of scans can be given as a folder again and again."""
+    """A folder that receives scans can be given again and again."""
     folder = tmp_path / "atlas"
     written(folder, frame, members[:2])
     twin = replace(livers[1], name="twin")
@@ -125,7 +125,7 @@ def test_responses_are_kept_and_must_fit(
             bad.read_response(bad.anatomies[0])
 
 
-# --- one, the same, too large -----------------------------------------------------------------
+# --- one anatomy, duplicates, too large -------------------------------------------------------
 
 
 def test_duplicates_are_kept_and_reported(
@@ -154,7 +154,7 @@ def test_equal_vectors_are_found_among_those_of_equal_length() -> None:
 def test_what_is_doubtful_of_a_file_is_said(
     template: Template, livers: list[SurfaceMesh], tmp_path: Path
 ) -> None:
-    """Axes that its header contradicts, and an organ too small for a liver."""
+    """A header with contradicting axes, and an organ too small for a liver."""
     small = replace(livers[0], vertices=0.7 * livers[0].vertices)
     file = write_obj(tmp_path / "liver0.obj", small)
     file.write_text("# SPACE=LPS\n" + file.read_text())

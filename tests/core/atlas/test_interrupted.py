@@ -1,4 +1,4 @@
-"""A build survives what interrupts it."""
+"""A build survives interruptions."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_an_interrupted_build_goes_on_where_it_stopped(
     with pytest.raises(StopError):
         build(progress=stop_after(3))
     assert load_atlas(folder).names == ("liver0", "liver1", "liver2")
-    (folder / "liver1" / SHAPE).unlink()  # the last file of an anatomy: a kill before it
+    (folder / "liver1" / SHAPE).unlink()  # last file of an anatomy: as if killed before writing it
     before = files_of(folder)
     calls.clear()
     seen: list[tuple[int, int]] = []

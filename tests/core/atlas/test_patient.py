@@ -37,14 +37,14 @@ from avatar_core.shapes.barycenter import barycenter
 from tests.helpers.bent_base import bent_phantoms, patient_mesh, registration_of
 from tests.helpers.known_surfaces import ball
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds organs
 
 ROOMY = ReductionRule(n_start=20, n_block=6, n_probes=8, max_solution_fraction=0.6)
 
 
 @dataclass(frozen=True)
 class Case:
-    """A base of bent phantoms, a patient outside it, and all his solutions."""
+    """A base of bent phantoms, a patient outside it, and all solutions of the patient."""
 
     base: PatientBase
     problem: PatientProblem
@@ -64,7 +64,7 @@ def case() -> Case:
 
 
 def _error(case: Case, estimate: np.ndarray) -> np.ndarray:
-    """Mass-weighted relative L2 error of each load position."""
+    """Return the mass-weighted relative L2 error of each load position."""
     mass = np.repeat(case.problem.mesh.vertex_volumes, 3)[:, None]
     off = (mass * (estimate - case.exact) ** 2).sum(axis=0).reshape(-1, 3).sum(axis=1)
     return np.sqrt(off / (mass * case.exact**2).sum(axis=0).reshape(-1, 3).sum(axis=1))
@@ -91,7 +91,7 @@ def test_a_duplicate_in_the_base_does_not_break_kriging() -> None:
     doubled = np.vstack([vectors, vectors[2]])
     point = vectors.mean(axis=0) + 0.3
     single, double = kriging(list(vectors), point, 5), kriging(list(doubled), point, 6)
-    # the twins share the weight of one; singular system, hence not to rounding
+    # the twins divide one weight; the system is singular, hence not to rounding
     np.testing.assert_allclose(
         double.combine(list(doubled)), single.combine(list(vectors)), atol=1e-6
     )
@@ -137,9 +137,9 @@ def test_basis_that_holds_the_solution_is_exact(case: Case) -> None:
 
 
 def test_residuals_are_those_of_the_vectors_themselves(case: Case) -> None:
-    """r = f - K X Y^T at the loaded nodes, in the norm of D; nothing is left of loads in X.
+    """r = f - K X Y^T at the loaded nodes, in the norm of D; loads in X leave no residual.
 
-    At a clamped node, of K X, without the reaction of the clamp.
+    At a clamped node it is that of K X, without the reaction of the clamp.
     """
     elasticity, loads = case.problem.elasticity, case.loads
     basis = GalerkinBasis(elasticity, loads)
@@ -190,7 +190,7 @@ def test_estimate_brackets_the_error_and_the_tolerance_is_met(case: Case) -> Non
 
 
 def test_a_large_compliance_does_not_hide_a_residual() -> None:
-    """Of a lobe that gives way a hundred times as far, with three times the residual of others."""
+    """A lobe is a hundred times more compliant, with three times the residual of other loads."""
     residual = np.array([1.0, 1.0, 1.0, 3.0])
     basis: Any = SimpleNamespace(
         compliance_trace=lambda: np.array([1.0, 1.0, 1.0, 100.0]), load_norm=np.ones(4)
@@ -202,7 +202,7 @@ def test_a_large_compliance_does_not_hide_a_residual() -> None:
 
 
 def test_the_worst_that_is_said_is_no_less_than_a_probe() -> None:
-    """Of three loads with the same residual, one is four times as wrong as the others."""
+    """Three loads have the same residual; the error of one is four times that of the others."""
     basis: Any = SimpleNamespace(
         compliance_trace=lambda: np.ones(3), load_norm=np.ones(3), rank=1, solutions=1
     )
@@ -324,7 +324,7 @@ def test_weights_on_a_grid_need_one(case: Case, weighting: Weighting) -> None:
 
 
 def test_a_ridge_spreads_the_weights_of_all_neighbours(case: Case) -> None:
-    """Weights far above one would tell apart what the base cannot."""
+    """Weights far above one would distinguish members that the base cannot tell apart."""
     around = (case.base, case.problem.registration, case.problem.surface)
     spread = patient_weights(*around, "lle-template")
     assert len(spread.weights) == len(case.base.names)
@@ -347,7 +347,7 @@ def test_what_a_registered_template_misses_is_measured_and_said(case: Case) -> N
     vertices[tip] += 0.02 * out / np.linalg.norm(out)
     longer = replace(problem, surface=replace(case.problem.surface, vertices=vertices))
     points, faces = missed_part(longer)
-    assert len(missed_part(problem)[1]) < len(faces) < 20  # those around the tip
+    assert len(missed_part(problem)[1]) < len(faces) < 20  # faces around the tip
     assert (np.linalg.norm(points - vertices[tip], axis=1) < 0.06).all()
     far, place = missed(longer)
     np.testing.assert_array_equal(place, vertices[tip])

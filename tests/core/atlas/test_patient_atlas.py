@@ -29,7 +29,7 @@ from avatar_core.vademecum.storage import load_vademecum
 from tests.core.atlas.rough import OPTIONS, Command, make_livers, make_template, write_obj, written
 from tests.helpers.disk_cache import cached_on_disk
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds organs
 
 QUICK = PatientOptions(n_vertices=350, n_certified=6, tolerance=0.1)
 N = 4  # members of the atlas; the next liver is a patient
@@ -75,7 +75,7 @@ def test_a_member_gets_its_own_vademecum_bit_for_bit(
     assert member.weights[1:].any() == np.False_
     own, response = member.vademecum, atlas.read_response(atlas["liver2"])
     assert np.array_equal(own.mesh.vertices, atlas["liver2"].registered)
-    np.testing.assert_allclose(  # modes are sorted by worth, which rotates them
+    np.testing.assert_allclose(  # modes are sorted by their contribution, which rotates them
         own.contact_load @ own.contact_load.T, response.load @ response.load.T, atol=1e-8
     )
     for j in range(0, own.surface.n_positions, 11):

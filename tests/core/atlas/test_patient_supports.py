@@ -22,7 +22,7 @@ from avatar_core.shapes.registration import Registration
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from tests.helpers.bent_base import bent_phantoms, patient_mesh
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds organs
 
 HELD = tuple(SupportOption.parse(text) for text in ("cava_groove", "bare_area=3e6"))
 

@@ -63,7 +63,7 @@ def test_processes_give_the_same_atlas(
     file = tmp_path / "atlas"
     growth = create_atlas(file, livers[:2], OPTIONS, template=template, workers=Workers(jobs=2))
     assert growth.added == ("liver0", "liver1")
-    # sums in other orders when threads are more or fewer: rounding, through a converged iteration
+    # the number of threads changes the order of sums: rounding, through a converged iteration
     for one, other in zip(load_atlas(file).vectors, members, strict=False):
         np.testing.assert_allclose(one, other.distances, atol=1e-6)
     assert os.environ.get("OMP_NUM_THREADS") == threads
@@ -78,7 +78,7 @@ def test_a_process_that_dies_costs_its_own_result_only() -> None:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    """A real scheduler and two worker processes."""
+    """Start a real scheduler and two worker processes."""
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None
@@ -118,14 +118,14 @@ def test_a_cluster_builds_too_though_a_worker_is_killed(
         np.testing.assert_allclose(one, other.distances, atol=1e-6)
 
 
-@pytest.mark.long  # the scheduler tries it on four workers, each of which has to start again
+@pytest.mark.long  # the scheduler tries it on four workers, each of which must start again
 def test_a_task_that_kills_every_worker_costs_its_own_result_only(
     cluster: Any, tmp_path: Path
 ) -> None:
     def noted(name: str, value: int) -> str:
         return f"(__import__('pathlib').Path({str(tmp_path / name)!r}).touch(), {value})[1]"
 
-    # last, and well after them: tasks that share a worker with it when it dies are blamed alike
+    # last, and well after the others: tasks on a dying worker are blamed alike
     done = f"len(__import__('os').listdir({str(tmp_path)!r})) == 2"
     pause = "__import__('time').sleep"
     last = (

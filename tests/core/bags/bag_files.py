@@ -32,7 +32,7 @@ RADIUS = 5e-3
 
 
 def own_types() -> dict[str, Any]:
-    """Types of avatar_ros, from its own files."""
+    """Return the types of avatar_ros, read from its own files."""
     found: dict[str, Any] = {}
     for name in ("Contact", "ContactState", "VademecumInfo"):
         text = (MESSAGES / f"{name}.msg").read_text()
@@ -46,7 +46,7 @@ STORE.register(own_types())
 
 @dataclass(frozen=True)
 class Message:
-    """What a recorder receives."""
+    """A message as a recorder receives it."""
 
     received: int
     topic: str
@@ -56,7 +56,7 @@ class Message:
 
 @dataclass
 class Cell:
-    """What a contact loop answered, one entry per period; forces as computed and as sent."""
+    """Answers of a contact loop, one entry per period; forces as computed and as sent."""
 
     vademecum_id: str
     stamp: np.ndarray
@@ -70,7 +70,7 @@ class Cell:
     def messages(
         self, tool: str = "/tool", frame: str = "organ", states: bool = False
     ) -> list[Message]:
-        """Poses and wrenches as a recorder would receive them, a fifth of a period apart."""
+        """Return poses and wrenches as a recorder would receive them, a fifth of a period apart."""
         found = []
         for k, stamp in enumerate(self.stamp.tolist()):
             head = header(stamp, frame)
@@ -90,7 +90,7 @@ class Cell:
         return vector(q, "Quaternion")
 
     def _state(self, k: int, tool: str) -> Any:
-        """With the force shared by two contacts, of which the second takes nothing."""
+        """Return a state whose force two contacts divide; the second bears nothing."""
         zero = vector(np.zeros(3))
         contacts = [
             make("avatar_ros/msg/Contact", vector(self.tip[k], "Point"), zero, vector(part), 0.0)
@@ -114,7 +114,7 @@ class Cell:
 def simulated_cell(
     vademecum: Vademecum, effects: Iterable[Effect] = (), limits: ForceLimits = DEVICES["sigma"]
 ) -> Cell:
-    """A push and a slide at 1 kHz, from 250 ms off the organ on; the forces are guarded."""
+    """Simulate a push and a slide at 1 kHz, starting 250 ms off the organ; forces are guarded."""
     path = push_and_slide(vademecum, RADIUS, 4e-3, 3e-3, 500, 40)
     off = path[0] + 0.05 * (path[0] - path[len(path) // 2]) / np.linalg.norm(path[0] - path[250])
     tips = np.concatenate([np.repeat(off[None], 250, 0), path, np.repeat(off[None], 30, 0)])
@@ -148,7 +148,7 @@ def header(stamp: int, frame: str) -> Any:
 
 
 def info(identity: str) -> Message:
-    """What the loader announces, latched."""
+    """Return the latched announcement of the loader."""
     fields = ["liver", "liver.obj", "1.0", "RAS", *[1] * 6, *[0.5] * 4, True, *[0.01] * 7]
     message = make(INFO, header(START, "organ"), identity, *fields)
     return Message(START, "/vademecum_info", INFO, message)
@@ -161,7 +161,7 @@ def write_rosbag(
     version: Any = 9,
     compression: str = "NONE",
 ) -> Path:
-    """A bag in a folder, by rosbags; returns the folder."""
+    """Write a bag in a folder by rosbags; return the folder."""
     writer = Writer(folder, version=version, storage_plugin=StoragePlugin[plugin])
     writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
     with writer:
@@ -180,7 +180,7 @@ def write_mcap(
     compression: CompressionType = CompressionType.ZSTD,
     chunk_size: int = 1 << 16,
 ) -> Path:
-    """An MCAP file, by mcap-ros2-support."""
+    """Write an MCAP file by mcap-ros2-support."""
     with path.open("wb") as file:
         writer = McapWriter(file, chunk_size=chunk_size, compression=compression)
         schemas: dict[str, Any] = {}
@@ -196,7 +196,7 @@ def write_mcap(
 
 
 def _plain(message: Any) -> Any:
-    """As mcap-ros2-support takes messages: plain objects."""
+    """Return a message as mcap-ros2-support takes it: plain objects."""
     if hasattr(message, "__msgtype__"):
         held = {key: _plain(value) for key, value in vars(message).items()}
         return SimpleNamespace(**held)
@@ -204,7 +204,7 @@ def _plain(message: Any) -> Any:
 
 
 def only(messages: Iterable[Message], *endings: str) -> Iterator[Message]:
-    """Messages of the topics that end so."""
+    """Select messages of the topics with these endings."""
     return (one for one in messages if one.topic.endswith(endings))
 
 

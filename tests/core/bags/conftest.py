@@ -1,4 +1,4 @@
-"""An organ, a cell that was recorded with it, and a file of that."""
+"""An organ, a cell that was recorded with it, and a file of that recording."""
 
 from __future__ import annotations
 
@@ -26,5 +26,5 @@ def cell(organ: Vademecum) -> Cell:
 
 @pytest.fixture(scope="module")
 def whole(cell: Cell, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An MCAP file of some chunks, by mcap-ros2-support."""
+    """Write an MCAP file of several chunks by mcap-ros2-support."""
     return write_mcap(tmp_path_factory.mktemp("whole") / "whole.mcap", cell.messages())

@@ -1,4 +1,4 @@
-"""Bags that are cut, spoilt or lie are read as far as they go, or refused in one line."""
+"""Bags that are cut, damaged or false are read as far as possible, or refused in one line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from avatar_core.scene.model import Scene
 from avatar_core.vademecum.model import Vademecum
 from tests.core.bags.bag_files import PERIOD, Cell, write_mcap, write_rosbag
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it simulates a cell
 
 Spoil = Callable[[bytes], bytes]
 
@@ -30,7 +30,7 @@ def cut(part: float) -> Spoil:
 
 
 def zeros(n: int | None = None) -> Spoil:
-    """From the middle on."""
+    """Return a change that zeroes n bytes from the middle on."""
 
     def spoil(content: bytes) -> bytes:
         middle = len(content) // 2
@@ -46,7 +46,7 @@ def zeros(n: int | None = None) -> Spoil:
         (cut(0.3), 0.05, 1.0, "was not closed: all but its last"),
         (cut(0.6), 0.35, 1.0, "was not closed: all but its last"),
         (cut(0.95), 0.7, 1.0, "was not closed: all but its last"),
-        # as a disk leaves one whose power failed; the last chunk is half zero
+        # as after a power failure; the last chunk is half zero
         (zeros(), 0.2, 0.6, "was not closed"),
         (zeros(2000), 0.2, 0.7, "damaged after"),
     ],
@@ -93,7 +93,7 @@ def test_a_folder_without_metadata(cell: Cell, tmp_path: Path) -> None:
 def test_a_compressed_bag_without_metadata(
     plugin: str, compression: str, cell: Cell, tmp_path: Path
 ) -> None:
-    """And a file of it alone."""
+    """Metadata are missing; a single file alone is read, too."""
     folder = write_rosbag(tmp_path / "bag", cell.messages(), plugin, 9, compression)
     (folder / "metadata.yaml").unlink()
     (file,) = folder.iterdir()
@@ -116,7 +116,7 @@ def test_a_file_that_the_metadata_list_is_missing(cell: Cell, tmp_path: Path) ->
 def test_a_clock_that_is_set_back(
     back: int, chunks: bool, organ: Vademecum, cell: Cell, tmp_path: Path
 ) -> None:
-    """In the middle of a push; stamps come again, or do not."""
+    """The clock jumps in the middle of a push; stamps repeat, or do not."""
     moved = replace(cell, stamp=cell.stamp - back * (np.arange(len(cell.stamp)) >= 400))
     messages, bag = moved.messages(), tmp_path / "bag"
     if chunks:
@@ -134,7 +134,7 @@ def test_a_clock_that_is_set_back(
 def test_metadata_that_names_another_quality_of_service(
     plugin: str, cell: Cell, tmp_path: Path
 ) -> None:
-    """As in some bags of rosbag2 itself; the library alone reads nothing of them."""
+    """Some bags of rosbag2 itself have this; the library alone reads nothing of them."""
     bag = write_rosbag(tmp_path / "bag", cell.messages(), plugin, 8)
     held = yaml.safe_load((bag / "metadata.yaml").read_text())
     qos = "- {history: 3, depth: 0, reliability: 1, durability: 2, deadline: {sec: 1, nsec: 0}, "
@@ -170,7 +170,7 @@ def test_sqlite_that_is_damaged_is_refused(garbage: str, cell: Cell, tmp_path: P
 
 @pytest.mark.parametrize("closed", [True, False])
 def test_sizes_that_lie(closed: bool, whole: Path, cell: Cell, tmp_path: Path) -> None:
-    """A chunk, its content and the header that claim more than there is."""
+    """A chunk, its content and the header claim more bytes than there are."""
     content = bytearray(whole.read_bytes())
     chunk = content.index(b"\x06", 8 + 9)
     while struct.unpack_from("<Q", content, chunk + 1)[0] > len(content):

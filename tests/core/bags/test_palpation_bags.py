@@ -1,4 +1,4 @@
-"""Forces of a sensor in a bag, on the path of the tip."""
+"""Sensor forces in a bag, on the path of the tip."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WRENCH_ONLY = "geometry_msgs/msg/Wrench"
 
 
 def test_a_sensor_is_read_rather_than_what_the_cell_computed(cell: Cell, tmp_path: Path) -> None:
-    """measured_cf at its own times, its force between two messages; servo_cf where it is alone."""
+    """measured_cf is used at its own times, interpolated; servo_cf only without measured_cf."""
     computed = cell.messages()
     path = measured_path(TouchFile(write_mcap(tmp_path / "computed.mcap", computed)))
     assert "servo_cf, which the cell computed" in path.notes[-1]
@@ -58,7 +58,7 @@ def test_a_bag_without_forces_or_with_gaps(cell: Cell, tmp_path: Path) -> None:
 def test_forces_that_are_received_late_are_those_of_their_stamps(
     late: int, cell: Cell, tmp_path: Path
 ) -> None:
-    """Where the stamps of a topic do not tell, as one that is repeated, receipt does."""
+    """Where stamps do not tell times, e.g. because they repeat, the time of receipt does."""
     messages = sensed(cell, late * PERIOD)
     path = measured_path(TouchFile(write_mcap(tmp_path / "late.mcap", messages)))
     np.testing.assert_allclose(path.vector, cell.force, atol=1e-9)
@@ -74,8 +74,10 @@ def test_forces_that_are_received_late_are_those_of_their_stamps(
 
 
 def sensed(cell: Cell, late: int, other: int | None = None) -> list[Message]:
-    """Poses, and forces of a sensor that are received late, with their stamps or another one;
-    beyond the end of the recording, with the clock of another machine."""
+    """Return poses and late sensor forces, with their own stamps or another one.
+
+    Forces also come after the end of the recording, and by the clock of another machine.
+    """
     found = [*only(cell.messages(), "measured_cp")]
     for k, stamp in enumerate(cell.stamp.tolist()):
         said = stamp if other is None else other + (stamp - START) * (other > START)

@@ -1,4 +1,4 @@
-"""Bags that others wrote are replayed as our recordings; what we write, others read."""
+"""Foreign bags are replayed like our recordings, and others read the bags that we write."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ from tests.core.bags.bag_files import (
 )
 from tests.core.conftest import Command
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds organs and simulates a cell
 
-SAME = 1e-9  # [N]
+SAME = 1e-9  # tolerance of equal forces [N]
 SCENE = write_scene(Scene())
 Writer = Callable[[Path, Iterable[Message]], Path]
 
@@ -58,7 +58,7 @@ Writer = Callable[[Path, Iterable[Message]], Path]
 def replayed(
     path: Path, organ: Vademecum, limits: ForceLimits = DEVICES["sigma"], **how: Any
 ) -> tuple[BagPath, Replayed]:
-    """A bag's path and its replay, as the command makes them."""
+    """Return a bag's path and its replay, as the command makes them."""
     bag = read_bag(path, how.pop("tool", None))
     scene = how.pop("scene", SCENE)
     found = path_of(bag, scene, organ.id, **how)
@@ -116,7 +116,7 @@ def test_forces_of_a_cell_are_the_same(
 def test_the_computed_forces_are_compared_where_states_are_recorded(
     organ: Vademecum, cell: Cell, tmp_path: Path
 ) -> None:
-    """Also those that the guard faded in, and limited."""
+    """Forces that the guard faded in or limited are compared, too."""
     cut = slice(240, None)  # the force comes while it is faded in
     kept = {k: v[cut] for k, v in vars(cell).items() if k not in ("vademecum_id", "orientation")}
     weak = Cell(cell.vademecum_id, **kept)
@@ -131,7 +131,7 @@ def test_the_computed_forces_are_compared_where_states_are_recorded(
 def test_states_of_before_jaws_are_read(
     organ: Vademecum, cell: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They end before ``held``."""
+    """Messages of earlier versions end before ``held``."""
     whole = STORE.serialize_cdr
 
     def shorter(message: Any, kind: str) -> Any:
@@ -189,7 +189,7 @@ VISCOUS = Viscoelasticity(g=(0.3,), tau=(0.1,))
 
 
 def recorded(organ: Vademecum, effects: tuple[Any, ...], turning: bool = False) -> Recording:
-    """A recording as the planning page makes them, with a pose that failed and lost periods."""
+    """Return a recording as the planning page makes it, with a failed pose and lost periods."""
     cell = bag_files.simulated_cell(organ, effects)
     n = len(cell.stamp)
     turn = np.clip(np.arange(n) - 400, 0, 100)[:, None] * [0.0, 2e-3, 1e-3] * turning
@@ -296,7 +296,7 @@ def test_nothing_is_written_over(organ: Vademecum, tmp_path: Path) -> None:
     assert file.read_text() == "mine" and list(tmp_path.iterdir()) == [file]
 
 
-# --- what bags are like -----------------------------------------------------------------------
+# --- variants of bags -------------------------------------------------------------------------
 
 
 def test_messages_in_any_order_and_twice(organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
@@ -315,7 +315,7 @@ def test_messages_in_any_order_and_twice(organ: Vademecum, cell: Cell, tmp_path:
 def test_gaps_are_lost_periods_if_they_matter(
     effects: tuple[Any, ...], n: int, lost: int, organ: Vademecum, cell: Cell, tmp_path: Path
 ) -> None:
-    """Elastic forces do not depend on what was between."""
+    """Elastic forces do not depend on the lost periods."""
     stamps = cell.stamp[300 : 300 + n].tolist()
     messages = [
         one
@@ -334,7 +334,7 @@ def test_gaps_are_lost_periods_if_they_matter(
 def test_a_long_gap_in_which_the_tip_rests_loses_nothing(
     organ: Vademecum, cell: Cell, tmp_path: Path
 ) -> None:
-    """With the computed forces, which do not depend on what the force guard did meanwhile."""
+    """The computed forces are compared: they do not depend on the force guard."""
     later = [
         replace(one, received=one.received + 50 * PERIOD * (one.received > int(cell.stamp[320])))
         for one in cell.messages(states=True)
@@ -360,7 +360,7 @@ def test_answers_to_lost_poses_are_left_out(organ: Vademecum, cell: Cell, tmp_pa
 
 
 def test_poses_that_the_loop_refused(organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
-    """A wrench that comes after one may be fading out."""
+    """A wrench after a refused pose may be fading out."""
     messages = cell.messages()
     nan = bag_files.vector([np.nan] * 3, "Point")
     turn = bag_files.vector([0.0, 0.0, 0.0, 1.0], "Quaternion")
@@ -381,7 +381,7 @@ def test_poses_that_the_loop_refused(organ: Vademecum, cell: Cell, tmp_path: Pat
 
 @pytest.mark.parametrize("axes", ["servo_cf", "body/servo_cf", "spatial/servo_cf"])
 def test_frames_of_devices(axes: str, organ: Vademecum, cell: Cell, tmp_path: Path) -> None:
-    """Poses and forces in a device's frame, which lies somewhere in the organ's."""
+    """Poses and forces are in a device's frame, somewhere in the organ's."""
     base = Rotation.from_rotvec([0.3, -1.1, 0.4])
     origin = np.array([0.02, 0.3, -0.1])
     gripper = Rotation.from_rotvec([1.0, 0.2, 0.1])

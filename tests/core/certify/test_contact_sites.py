@@ -1,4 +1,4 @@
-"""Contact sites: resolved contacts in a certificate, and the error that is said after them."""
+"""Contact sites: resolved contacts in a certificate, and the error estimated from them."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ Compared = Callable[..., list[SiteContact]]
 
 
 def contact(force: float, patch: float, law: float, site: Site = SITE) -> SiteContact:
-    """A contact whose resolved force is 2 N; the patch's and the law's part of its error [N]."""
+    """Return a contact with a resolved force of 2 N; errors by the patch and by the law [N]."""
     return SiteContact(site, BALL, 1e-3, 2.0, force, 0.0, patch + law, law, 6.0, 1.0, 0.05)
 
 
 @pytest.fixture(scope="module")
 def box() -> Vademecum:
-    """A small box with a handful of modes, and a certificate."""
+    """Build a small box with few modes, and a certificate."""
     mesh = box_mesh(4)
     regions = box_regions(mesh)
     elasticity = Elasticity(mesh, Material(), regions.clamped, "P1")
@@ -74,7 +74,7 @@ def box() -> Vademecum:
 
 
 def outline(vademecum: Vademecum) -> SurfaceMesh:
-    """The boundary of the organ's mesh."""
+    """Return the boundary of the organ's mesh."""
     return SurfaceMesh(
         vademecum.mesh.vertices[vademecum.mesh.surface_vertices], vademecum.surface_faces
     )
@@ -86,11 +86,11 @@ def certified(vademecum: Vademecum, found: ContactSites) -> Vademecum:
     )
 
 
-# --- The error that is said ----------------------------------------------------------------------
+# --- The estimated error -------------------------------------------------------------------------
 
 
 def pressed(vademecum: Vademecum) -> tuple[float, float, float]:
-    """Force on a sphere 2 mm deep, the error that is said, and the law's relative part of it."""
+    """Return the force on a sphere 2 mm deep, its estimated error, and the law's relative part."""
     tip = Tip("sphere", 5e-3)
     data = prepare(vademecum, (tip,), cloud="off", effects=())
     centre = np.array([0.05, 0.1, 0.05])
@@ -114,7 +114,7 @@ def test_the_factor_scales_the_laws_part_of_the_error_that_is_said(box: Vademecu
 def test_edges_are_the_thinnest_places_below_a_thickness(
     box: Vademecum, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A box of 0.1 m has none; one that counts as thin is as thick as it is."""
+    """A box of 0.1 m has none; with a larger threshold its edges count, at their own thickness."""
     surface = outline(box)
     assert contact_sites.edge_sites(box, surface, 3, seed=0) == []
     monkeypatch.setattr(contact_sites, "THIN", 0.2)
@@ -132,7 +132,7 @@ def test_an_organ_without_contact_sites_says_the_same_error_as_with_the_factor_o
 
 @pytest.mark.parametrize("scale", [0.3, 5.0])
 def test_the_factor_covers_nine_in_ten_contacts_and_hardly_more(scale: float) -> None:
-    """Both where the error said before was too small, and where it was too large."""
+    """The earlier estimate was too small, or too large."""
     rng = np.random.default_rng(1)
     contacts = [contact(2.0 + scale * e, 0.02, 0.1) for e in rng.normal(0.0, 0.1, 300)]
     found = summarized(contacts, law_factor(contacts))
@@ -152,7 +152,7 @@ def test_key_figures_are_those_of_the_contacts() -> None:
     assert found.mean == pytest.approx(0.05)
     assert found.worst == pytest.approx(0.1)
     assert found.p95 == pytest.approx(0.095)
-    assert found.coverage == pytest.approx(2 / 3)  # 2.2 N is 0.2 N off and says 0.15 N
+    assert found.coverage == pytest.approx(2 / 3)  # 2.2 N is 0.2 N off, with an estimate of 0.15 N
     assert found.overestimate == pytest.approx(1.5)
     assert summarized(contacts, 2.1).coverage == 1.0
 
@@ -161,7 +161,7 @@ def test_key_figures_are_those_of_the_contacts() -> None:
 
 
 def met(fails: Sequence[str] = ()) -> Compared:
-    """In place of resolved contacts: 4 % off, or no mesh at places of some kinds."""
+    """Return results in place of resolved contacts: 4 % off, or no mesh at places of some kinds."""
 
     def compared(*arguments: Any) -> list[SiteContact]:
         site = arguments[2]
@@ -300,7 +300,7 @@ def test_the_picture_compares_the_step_hertz_and_resolved_contact(
     assert curve.hertz[-1] == pytest.approx(4 / 3 * stiffness * np.sqrt(5e-3 * 5e-3**3))
     assert curve.force[0] == pytest.approx(0.0, abs=1e-6)
     assert (np.diff(curve.force) > 0.0).all() and (curve.error[1:] > 0.0).all()
-    assert (curve.force[1:] < curve.hertz[1:]).all()  # the box gives way besides
+    assert (curve.force[1:] < curve.hertz[1:]).all()  # the box is more compliant
     assert curve.misses(np.interp(curve.depth, picture.RESOLVED, 1.1 * truth)) == pytest.approx(0.1)
 
 
@@ -328,7 +328,7 @@ def test_the_picture_is_drawn_with_resolved_contact_or_without(
 
 @pytest.mark.long
 def test_resolved_contacts_on_a_cube_are_met_and_covered() -> None:
-    """Where the step agrees with Sneddon, it agrees with contacts resolved around it too."""
+    """Where the step agrees with Sneddon, it also agrees with contacts resolved around it."""
     cube = organ("cube").with_certificate(
         replace(Certificate.unknown(), force_error=ForceError(1.0, 0.01))
     )

@@ -1,4 +1,4 @@
-"""Where contacts that no build has seen are drawn."""
+"""Sampling of contacts that no build has seen."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from avatar_core.errors import ConvergenceError
 from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.vademecum.tip_field import TipField
 
-RADIUS = 0.03  # of the ball that is touched [m]
-LOBE = np.array([0.0, 0.0, 0.052]), 0.012  # another, over its pole: centre and radius [m]
+RADIUS = 0.03  # radius of the ball [m]
+LOBE = np.array([0.0, 0.0, 0.052]), 0.012  # a lobe over its pole: centre and radius [m]
 
 
 def organ(*lobes: tuple[np.ndarray, float]) -> Any:
-    """The upper half of a ball with lobes above it, as far as contacts are drawn from it."""
+    """Return the upper half of a ball with lobes, as far as contacts are drawn from it."""
     from tests.helpers.known_surfaces import ball
 
     surface = ball(RADIUS)

@@ -1,4 +1,4 @@
-"""The command: bad input is one clear line and exit code 1, and nothing is lost or in vain."""
+"""The command: bad input is one clear line and exit code 1; no work or file is lost."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def phantom_file(folder: Path) -> Path:
 
 @pytest.fixture
 def refused(avatar: Command, tmp_path: Path) -> Callable[[list[object], str], None]:
-    """Builds with some arguments, which is refused in one line and leaves nothing behind."""
+    """Build with arguments that are refused in one line, without leaving files."""
 
     def check(arguments: list[object], remedy: str) -> None:
         before = set(tmp_path.iterdir())
@@ -110,7 +110,7 @@ def test_bad_option(refused: Any, tmp_path: Path, options: list[str], remedy: st
         (None, "cannot read the resection"),
         ({"point": [1.0, 0.0, 0.0]}, "give a surface through the organ"),
         ({"open_along": [1.0, 0.0, 0.0]}, "opens along its own normal"),
-        # across the way from the clamp, behind and above, to the front
+        # across the direction from the clamp to the front
         (
             {"normal": [0.0, -1.0, 1.0], "open_along": [1.0, 0.0, 0.0]},
             "nothing holds the first part",
@@ -144,7 +144,7 @@ def test_axes_of_a_tumour(tmp_path: Path, states: str, given: str | None, read: 
 
 
 def test_a_tumour_in_a_label_map_lies_where_its_voxels_do(tmp_path: Path) -> None:
-    """And has not the axes of the organ's file."""
+    """Its axes differ from those of the organ's file."""
     organ = phantom_file(tmp_path)
     organ.write_text("# SPACE=LPS\n" + organ.read_text())
     surface = read_organ(str(organ), "mm", None, None)
@@ -222,7 +222,7 @@ def test_unknown_option_is_a_usage_error(avatar: Command) -> None:
 
 
 def commands(group: Any, *words: str) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Every command of a group, with the words that call it."""
+    """Yield every command of a group, with the words that call it."""
     for name, command in group.commands.items():
         if hasattr(command, "commands"):
             yield from commands(command, *words, name)
@@ -256,7 +256,7 @@ def test_ctrl_c_is_said_and_leaves_nothing(
 
     source = phantom_file(tmp_path)
     monkeypatch.setattr("avatar_core.pipeline.build", meshed_then_stopped)
-    # a shell starts what runs in the background with the signal ignored
+    # a shell starts background processes with the signal ignored
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         code, _, err = avatar("vademecum", source, "-o", tmp_path / "liver.h5")
@@ -296,7 +296,7 @@ def nothing_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
 def said(  # type: ignore[no-untyped-def]
     nothing_is_computed: None, avatar: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
-    """Runs a command in a folder with one file of each kind, which stay as they are."""
+    """Run a command in a folder with one file of each kind, and check that they stay."""
     monkeypatch.chdir(tmp_path)
     for name in ("liver.obj", "tumour.obj", "groups.npz", "text.h5"):
         Path(name).write_text(name)
@@ -396,12 +396,12 @@ def test_what_may_be_written_is_begun(said, command):  # type: ignore[no-untyped
     "command", [f"{ORGAN} new.h5", f"{PATIENT} new.h5", "export v.h5 -o a.vtu"]
 )
 def test_a_read_only_folder_is_refused(said, monkeypatch, command):  # type: ignore[no-untyped-def]
-    # asked of os.access, because the superuser may write anywhere
+    # os.access is replaced, because the superuser may write anywhere
     monkeypatch.setattr(os, "access", lambda _, mode, **__: not mode & os.W_OK)
     assert "cannot be written to" in said(command)
 
 
-# --- What a command says about its time -----------------------------------------------------------
+# --- Times that a command prints ------------------------------------------------------------------
 
 
 BUSY = "import time\nwhile time.process_time() < 0.4: pass"
@@ -458,7 +458,7 @@ def test_a_file_that_cannot_be_written_is_refused_first(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_the_same_surface_gives_the_same_vademecum(livers_dir: Path, tmp_path: Path) -> None:
-    """On one thread and on two, each in a process of its own: bit for bit but for times."""
+    """Builds on one and two threads, in separate processes, agree bit for bit except for times."""
     built = [tmp_path / f"{n}.h5" for n in (1, 2)]
     processes = [
         ModuleProcess(

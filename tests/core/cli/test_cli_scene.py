@@ -1,4 +1,4 @@
-"""``avatar scene``: what a scene is, whether its effects go together, what a step of it costs."""
+"""``avatar scene``: content of a scene, compatibility of its effects, cost of a step."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from tests.core.conftest import Command
 from tests.helpers.contact import prepare, step
 from tests.helpers.paths import PARAMS
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds organs
 
 SCENES = PARAMS / "scenes"
 
 
 @pytest.fixture
 def run(avatar: Command) -> Any:
-    """Runs ``avatar scene ...``: exit code, output, errors."""
+    """Run ``avatar scene ...``; return exit code, output, errors."""
     return partial(avatar, "scene")
 
 
@@ -46,11 +46,11 @@ def phantom_h5(phantom_vademecum: Vademecum, tmp_path_factory: pytest.TempPathFa
     return path
 
 
-# --- where scenes are -----------------------------------------------------------------------------
+# --- folders of scenes ----------------------------------------------------------------------------
 
 
 def test_shipped_scenes_are_those_of_the_repository() -> None:
-    """Wherever they are found, in a checkout or installed."""
+    """They are found in a checkout and in an installation."""
     shipped = {name: path.read_text() for name, path in shipped_scenes().items()}
     assert shipped == {path.stem: path.read_text() for path in sorted(SCENES.glob("*.yaml"))}
     assert "palpation" in shipped
@@ -95,7 +95,7 @@ def test_list_names_every_shipped_scene_with_its_effects(run: Any) -> None:
         assert re.search(rf"^{name} +{re.escape(one.text)}\n +effects: {effects}$", out, re.M)
 
 
-# --- what a scene is ------------------------------------------------------------------------------
+# --- content of a scene ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", shipped_scenes())
@@ -165,7 +165,7 @@ def test_what_does_not_fit_is_one_line(
     vademecum: str | None,
     reason: str,
 ) -> None:
-    """And nothing is compiled before."""
+    """It is refused before anything is compiled."""
     monkeypatch.setattr(bench_scene, "_prepared", None)
     (tmp_path / "bad.yaml").write_text("effects: [fricton]")
     monkeypatch.chdir(tmp_path)
@@ -176,7 +176,7 @@ def test_what_does_not_fit_is_one_line(
     assert reason in err
 
 
-# --- how wrong its combinations are ---------------------------------------------------------------
+# --- errors of its combinations -------------------------------------------------------------------
 
 
 def test_check_says_how_wrong_a_combination_is(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -194,7 +194,7 @@ def test_check_says_how_wrong_a_combination_is(run: Any, monkeypatch: pytest.Mon
     assert re.search(r"^avatar: .*self_weight: .*16%.*above 15%", err)
 
 
-# --- what a step costs ----------------------------------------------------------------------------
+# --- cost of a step -------------------------------------------------------------------------------
 
 
 def test_check_times_the_scene_beside_the_bare_step(
@@ -216,7 +216,7 @@ def test_check_times_the_scene_beside_the_bare_step(
 def test_a_scene_without_effects_is_the_bare_step(
     run: Any, monkeypatch: pytest.MonkeyPatch, phantom_h5: Path
 ) -> None:
-    """And is timed once; here as if no step had touched."""
+    """It is timed only once; here as if no step had touched."""
     row = StepCost("bare", float("nan"), float("nan"), 0, 1_000_000, 0.1)
     monkeypatch.setattr(bench_scene, "time_scene", lambda *_: (row,))
     code, out, _ = run("check", "palpation", "--vademecum", phantom_h5)
@@ -246,7 +246,7 @@ def test_the_bare_step_has_one_tool_and_no_effect(
 
 
 def test_tools_push_and_slide_without_a_jump(phantom_vademecum: Vademecum) -> None:
-    """They come in through the surface, as deep as they are asked."""
+    """They enter through the surface, to the requested depth."""
     radius = 2e-3
     path = push_and_slide(
         phantom_vademecum, radius, PUSH, DEPTH, 600, middle_of_access(phantom_vademecum)
@@ -265,7 +265,7 @@ def test_tools_push_and_slide_without_a_jump(phantom_vademecum: Vademecum) -> No
 
 
 def test_tools_follow_the_breath(phantom_vademecum: Vademecum) -> None:
-    """What they feel on an organ that moves is what they feel on one at rest."""
+    """Forces on an organ that moves equal those on one at rest."""
     tools = (Tool("tool"),)
     breath = Respiration(period=0.5)
     still = _prepared(phantom_vademecum, Scene(tools=tools, cloud="off"), "bare")

@@ -1,4 +1,4 @@
-"""Compiled code reads named tuples of arrays by address as it reads them by value."""
+"""Compiled code reads named tuples of arrays by address and by value alike."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_the_arrays_live_as_long_as_the_table() -> None:
 
 
 def test_a_type_tells_all_that_code_may_follow_from(outer: Any) -> None:
-    """Compiled code on disk is found by it."""
+    """The type identifies compiled code on disk."""
     members = {"grid": array("x y z"), "inner": Inner}
     kinds = [
         members,

@@ -1,4 +1,4 @@
-"""Numbers of few bits."""
+"""Numbers with few bits."""
 
 from __future__ import annotations
 

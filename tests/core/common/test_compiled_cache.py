@@ -1,4 +1,4 @@
-"""Compiled functions on disk: a change in any file that they are made of is another cache."""
+"""Compiled functions on disk: a change in any file they are made of gives another cache."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ print(total(1.0), total.stats.cache_hits[(total.signatures[0])] if total.stats.c
 
 
 def run(package: Path, cache: Path, factor: float) -> list[str]:
-    """What a compiled function gives whose inlined part, in another file, has this factor."""
+    """Run a compiled function whose inlined part, in another file, has this factor."""
     contact = package / "avatar_core" / "contact"
     (contact / "helper_of_test.py").write_text(HELPER.format(factor=factor))
     (contact / "user_of_test.py").write_text(USER)
     environment = {**os.environ, "PYTHONPATH": str(package), "NUMBA_CACHE_DIR": str(cache)}
-    environment["PYTHONDONTWRITEBYTECODE"] = "1"  # which knows a file by its second and size
+    environment["PYTHONDONTWRITEBYTECODE"] = "1"  # Python knows a file by its second and size
     command = [sys.executable, "-m", "avatar_core.contact.user_of_test"]
     found = subprocess.run(command, env=environment, cwd="/", capture_output=True, text=True)
     assert not found.returncode, found.stderr
@@ -50,13 +50,13 @@ def test_a_change_in_an_inlined_file_is_compiled_anew(tmp_path: Path) -> None:
     ignored = shutil.ignore_patterns("__pycache__", "studies", "cli", "atlas", "offline", "scene")
     shutil.copytree(PACKAGE, package / "avatar_core", ignore=ignored)
     assert run(package, cache, 2.0) == ["2.0", "0"]
-    assert run(package, cache, 2.0) == ["2.0", "1"]  # found
+    assert run(package, cache, 2.0) == ["2.0", "1"]  # found in the cache
     assert run(package, cache, 3.0) == ["3.0", "0"]  # numba's own cache answers 2 here
-    assert run(package, cache, 2.0) == ["2.0", "1"]  # the one before is kept
+    assert run(package, cache, 2.0) == ["2.0", "1"]  # the earlier result is kept
 
 
 def test_a_part_is_found_on_disk(tmp_path: Path) -> None:
-    """Another function, in another process, takes in what the first left of their part."""
+    """Another function, in another process, uses the compiled part that the first one left."""
     part = "from avatar_core.common.jit import inlined\n@inlined\ndef square(x): return x * x\n"
     uses = """
 from avatar_core.common.jit import entry
@@ -96,7 +96,7 @@ def test_folders_of_other_contents_do_not_pile_up(tmp_path: Path) -> None:
 
 
 def test_code_that_is_compiled_into_other_files_is_of_the_rooms_that_are_hashed() -> None:
-    """Studies compile for themselves alone, and their files add their own content."""
+    """Studies compile only for themselves, and their files add their own content."""
     package = Path(compiled_cache.__file__).parents[1]
     using = [p for p in package.rglob("*.py") if "avatar_core.common.jit import" in p.read_text()]
     assert {p.relative_to(package).parts[0] for p in using} <= {*compiled_cache.ROOMS, "studies"}

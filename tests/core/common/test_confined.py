@@ -1,4 +1,4 @@
-"""Calls in a process that may die of them."""
+"""Calls in a process that may die."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_call_is_given_up_by_another_thread(confined: Confined) -> None:
         confined.call(SECONDS, os.kill, first, signal.SIGSTOP)
     giving_up.join()
     assert confined.call(SECONDS, os.getpid) != first
-    Confined().kill()  # which has no process
+    Confined().kill()  # without a process
 
 
 @pytest.mark.parametrize("hang", [(time.sleep, 60.0), (sum, range(10**12))])
@@ -147,7 +147,7 @@ def test_a_child_without_its_module_says_its_exit_code() -> None:
 
 
 def test_a_signal_while_a_child_starts_leaves_none_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its handler raises only once the process is known to who has to end it."""
+    """The handler raises only once the process is known to the code that must end it."""
 
     def stop(number: int, frame: Any) -> None:
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""Arrays that were freed do not stay with a process that lives for long."""
+"""Freed arrays do not stay with a long-lived process."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ print(resident() - before)
 
 
 def kept(how: str) -> float:
-    """What a process keeps of arrays of 24 MB that it freed [MB]."""
+    """Return how much of freed arrays of 24 MB a process keeps [MB]."""
     done = subprocess.run(
         [sys.executable, "-c", _SCRIPT, how], capture_output=True, text=True, check=True
     )

@@ -1,4 +1,4 @@
-"""Mutated files at the doors of the core: each is refused in one line or loaded, in any case."""
+"""Mutated files at the core's loaders: each is refused in one line or loaded."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 
 from tests.helpers.fuzzing import campaign
 
-QUICK = range(300)  # a third for each door
+QUICK = range(300)  # a third for each loader
 LONG = range(10_000, 10_300)
 
 
@@ -20,5 +20,5 @@ def test_a_mutant_is_refused_or_loaded() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("door", ["vademecum", "atlas", "surface", "step"])
 def test_hundreds_of_mutants_are_refused_or_loaded(door: str) -> None:
-    """And a vademecum that loads can be touched."""
+    """A vademecum that loads can also be touched."""
     assert not campaign(door, LONG).failures()

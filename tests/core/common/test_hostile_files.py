@@ -1,4 +1,4 @@
-"""Files made to do harm: nothing is followed, run or allocated that was not weighed first."""
+"""Files made to do harm: nothing is followed, run or allocated without a check first."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from avatar_core.uncertainty.distributions import read_distributions
 from avatar_core.vademecum.storage import is_vademecum, load_vademecum, parse_vademecum
 from tests.helpers.file_mutations import pristine, sealed
 
-LARGEST = 20e6  # allocated for files of 60 kB [bytes]
+LARGEST = 20e6  # largest allocation for files of 60 kB [bytes]
 
 Change = Callable[[h5py.File], object]
 
@@ -37,7 +37,7 @@ def allocating_at_most(n_bytes: float) -> Iterator[None]:
 
 
 def put(key: str, **made: object) -> Change:
-    """Replaces an array."""
+    """Return a change that replaces an array."""
 
     def change(file: h5py.File) -> None:
         del file[key]
@@ -47,7 +47,7 @@ def put(key: str, **made: object) -> Change:
 
 
 def link(key: str, target: object) -> Change:
-    """Replaces an array or a group by a link."""
+    """Return a change that replaces an array or a group by a link."""
 
     def change(file: h5py.File) -> None:
         del file[key]
@@ -57,7 +57,7 @@ def link(key: str, target: object) -> Change:
 
 
 def say(key: str, value: object) -> Change:
-    """Replaces an attribute."""
+    """Return a change that replaces an attribute."""
     return lambda file: file.attrs.__setitem__(key, value)
 
 

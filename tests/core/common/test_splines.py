@@ -1,4 +1,4 @@
-"""Quadratic B-splines on a grid: what they reproduce, and that derivatives are derivatives."""
+"""Quadratic B-splines on a grid: reproduced fields, and derivatives."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_derivatives_are_those_of_the_value() -> None:
 
 
 def test_bricks_are_the_same_field() -> None:
-    """Of a field that vanishes in all bricks but two, next to each other."""
+    """The field vanishes in all bricks except two adjacent ones."""
     values = np.zeros((3 * BRICK, BRICK, 2 * BRICK))
     values[BRICK:, :, :BRICK] = np.random.default_rng(2).standard_normal((2 * BRICK, BRICK, BRICK))
     brick = np.array([[[-1, -1]], [[1, -1]], [[0, -1]]], np.int32)

@@ -138,7 +138,7 @@ def test_a_slow_push_has_no_force_of_the_mass() -> None:
 
 @pytest.fixture(scope="module")
 def sag(phantom_vademecum: Vademecum) -> np.ndarray:
-    """Displacement of all nodes by full finite elements, gravity along each axis, (3 n, 3)."""
+    """Return the displacement by full finite elements, gravity along each axis, (3 n, 3)."""
     elasticity = elasticity_of(phantom_vademecum)
     weight = 9.81 * mass_matrix(phantom_vademecum) @ np.tile(np.eye(3), (elasticity.n_nodes, 1))
     return np.asarray(elasticity.solve(weight))
@@ -165,7 +165,7 @@ def test_the_organ_sags_as_full_finite_elements_do(
 def test_a_tip_meets_the_organ_where_it_hangs(
     phantom_vademecum: Vademecum, sag: np.ndarray
 ) -> None:
-    """The patch under it has moved as full finite elements say, but for the smoothing of w(p)."""
+    """The patch under it moves as in full finite elements, except for the smoothing of w(p)."""
     v = phantom_vademecum
     inner, elasticity = inner_positions(v), elasticity_of(v)
     ratio = []

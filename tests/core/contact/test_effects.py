@@ -1,4 +1,4 @@
-"""Effects: absent where nobody asks for them, sane together, refused in one line."""
+"""Effects: absent unless requested, stable together, refused in one line."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ from tests.helpers.tool_motion import AWAY
 RADIUS = 10e-3
 SPHERE, PATCH = Tip("sphere", RADIUS), Tip("patch", RADIUS)
 GRASPER = replace(SPHERE, grasp=Jaw())
-OWN = ("large_deformation", "tumour", "tilt")  # tests: they need another organ, or another tip
+# these effects have their own tests: they need another organ, or another tip
+OWN = ("large_deformation", "tumour", "tilt")
 CHOICES: dict[str, Effect] = {
     name: kind.example() for name, kind in EFFECTS.items() if name not in OWN
 }
@@ -43,7 +44,7 @@ CHOICES |= {
 def test_an_effect_is_absent_from_the_step_when_off(
     phantom_vademecum: Vademecum, name: str
 ) -> None:
-    """No array in the model: only None."""
+    """The model then holds None, no array."""
     without = lay_out(phantom_vademecum, (PATCH,), effects=())
     tip = GRASPER if name == "grasp" else PATCH
     with_it = lay_out(phantom_vademecum, (tip,), effects=(CHOICES[name],))
@@ -51,7 +52,7 @@ def test_an_effect_is_absent_from_the_step_when_off(
     assert all(getattr(given, each, None) is None for each in ("superposition", *EFFECTS))
     assert EFFECTS[name].State is None or getattr(more, name) is not None
     assert not [key for key in flat(without) if "." in key]
-    brought = {"friction"} if name == "grasp" else set()  # whose solver has forces of any direction
+    brought = {"friction"} if name == "grasp" else set()  # its solver has forces of any direction
     assert [key for key in flat(with_it) if key.startswith(f"{name}.")]
     assert all(getattr(with_it, other) is None for other in CHOICES.keys() - {name} - brought)
 
@@ -73,7 +74,7 @@ def test_a_layout_survives_being_flat(phantom_vademecum: Vademecum) -> None:
 
 @pytest.mark.long
 def test_everything_at_once_stays_sane(phantom_vademecum: Vademecum) -> None:
-    """Two graspers, all effects, ten seconds of touching: finite, bounded, at rest in the end."""
+    """Two graspers, all effects, ten seconds of contact: finite, bounded, at rest in the end."""
     v = phantom_vademecum
     data = prepare(v, (GRASPER,) * 2, cloud="surface", effects=tuple(CHOICES.values()))
     rng = np.random.default_rng(0)
@@ -117,7 +118,7 @@ def test_two_tools_without_the_effect_are_refused(phantom_vademecum: Vademecum) 
     ],
 )
 def test_numbers_out_of_range_are_refused_in_one_line(make, message: str) -> None:  # type: ignore[no-untyped-def]
-    """More of them, in files: tests/core/scene/test_scene_file.py."""
+    """More such numbers, in files: tests/core/scene/test_scene_file.py."""
     with pytest.raises(SceneError) as refusal:
         make()
     assert message in str(refusal.value)

@@ -1,7 +1,7 @@
-"""Minutes of simulated 1 kHz: nothing grows, nothing drifts, nothing unknown is said.
+"""Minutes of simulated 1 kHz: no growth, no drift, no unknown status.
 
-The tip wanders at random in and out of the liver. What it has put in never falls below minus what
-the trapezoidal rule makes of every contact that ends within a step h: K h^2 / 8.
+The tip wanders at random in and out of the liver. The work put in never falls below minus the error
+of the trapezoidal rule. That is K h^2 / 8 for every contact that ends within a step h.
 """
 
 from __future__ import annotations
@@ -35,32 +35,32 @@ SCENES: dict[str, tuple[tuple[Effect, ...], int]] = {
 
 
 def resident() -> int:
-    """Memory of this process that is in no file, whether in RAM or swapped out [bytes]."""
+    """Return the memory of this process that is in no file, in RAM or swapped out [bytes]."""
     gc.collect()
     status = Path("/proc/self/status").read_text()
     return sum(1024 * int(kib) for kib in re.findall(r"(?:RssAnon|VmSwap):\s+(\d+) kB", status))
 
 
 def items() -> int:
-    """What all lists, dictionaries and sets hold: their memory grows too seldom to tell."""
+    """Count the entries of all lists, dictionaries and sets: their memory grows in rare steps."""
     gc.collect()
     return sum(len(o) for o in gc.get_objects() if type(o) in (list, dict, set, deque))
 
 
 def without_huge_pages() -> None:
-    """Else the kernel joins pages every ten seconds, and counts those that nobody has touched."""
+    """Disable huge pages, or the kernel joins pages every ten seconds and counts untouched ones."""
     ctypes.CDLL(None).prctl(PR_SET_THP_DISABLE, 1, 0, 0, 0)
 
 
 def documented() -> set[int]:
-    """Status codes of the page of contact_state."""
+    """Return the status codes on the page of contact_state."""
     codes = {int(code) for code in re.findall(r"^\| (\d+) `STATUS_", STATES.read_text(), re.M)}
     assert len(codes) > 5
     return codes
 
 
 def wander(spot: Spot, n_tools: int, n: int, rng: np.random.Generator) -> np.ndarray:
-    """A damped random walk about the surface, slower than 0.3 m/s, shape (n, n_tools, 3)."""
+    """Return a damped random walk about the surface, below 0.3 m/s, shape (n, n_tools, 3)."""
     q, v = np.zeros((n_tools, 3)), np.zeros((n_tools, 3))
     q[:, 0] = 1e-3
     q[:, 1] = 15e-3 * np.arange(n_tools)
@@ -75,13 +75,13 @@ def wander(spot: Spot, n_tools: int, n: int, rng: np.random.Generator) -> np.nda
 
 
 def check_energy(data: ContactData, path: np.ndarray, force: np.ndarray) -> None:
-    """The work so far and what the trapezoidal rule may miss of it are together never negative."""
+    """Check that work so far plus the trapezoidal rule's error is never negative."""
     stiff = 1.0 / float(data.model.arrays.self_compliance[data.model.arrays.row >= 0].min())
     way, touching = np.diff(path, axis=0), force.any(axis=2)
     work = -0.5 * ((force[1:] + force[:-1]) * way).sum(axis=(1, 2))
     changed = touching[1:] != touching[:-1]
     missed = stiff * (way**2).sum(axis=2) / 8.0
-    # F'' h^3 / 12 of the trapezoidal rule, of a force that is curved over the depth
+    # F'' h^3 / 12 of the trapezoidal rule, for a force that is curved over the depth
     bent = np.diff(force, 2, axis=0, prepend=np.zeros_like(force[:1]))
     curved = np.linalg.norm(bent, axis=2) * np.linalg.norm(way, axis=2) / 12.0
     bound = np.where(changed, missed, curved).sum(axis=1)
@@ -93,7 +93,7 @@ def check_energy(data: ContactData, path: np.ndarray, force: np.ndarray) -> None
     [("bare", 0.5, 8), *(pytest.param(scene, 3.0, 12, marks=pytest.mark.long) for scene in SCENES)],
 )
 def test_minutes_change_nothing(scene: str, minutes: float, n_stretches: int) -> None:
-    """So many minutes of contact, between as many rests as there are stretches."""
+    """Minutes of contact, separated by rests."""
     without_huge_pages()
     effects, n_tools = SCENES[scene]
     data = liver_model(effects, n_tools)
@@ -102,7 +102,7 @@ def test_minutes_change_nothing(scene: str, minutes: float, n_stretches: int) ->
     for k in range(n_stretches):
         data.reset()
         path = wander(places[k % 3], n_tools, round(minutes * MINUTE / n_stretches), rng)
-        path[1998::1999] = np.nan  # poses that are none; the rule spans their periods
+        path[1998::1999] = np.nan  # invalid poses; the rule spans their periods
         motion = follow(data, path)
         seen.update(motion.status.ravel().tolist())
         is_pose = np.isfinite(path[:, 0, 0])
@@ -111,7 +111,7 @@ def test_minutes_change_nothing(scene: str, minutes: float, n_stretches: int) ->
         for _ in range(14_000 if n_tools > 1 else 1):  # 18 times the slowest creep
             seen.add(step(data, away))
         assert np.abs(data.out.cloud[:, 3:]).max() < 1e-9
-        if k >= 3:  # the first touch every page of the model once
+        if k >= 3:  # the first steps touch every page of the model once
             memory.append(resident())
     assert np.mean(contacts) > 0.15
     assert seen <= documented()

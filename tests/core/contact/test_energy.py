@@ -1,7 +1,7 @@
-"""No path gains energy: the work of the tools is what the organ stores.
+"""No path gains energy: the work of the tools equals the energy stored in the organ.
 
-The energy of forces along a path is that of the trapezoidal rule; where a contact begins or ends
-within a step h it is wrong by at most K h^2 / 8 there.
+Work along a path is integrated by the trapezoidal rule. If a contact begins or ends within a step
+h, its error there is at most K h^2 / 8.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from tests.helpers.tool_motion import AWAY, energy_slope, follow, line, polygon,
 
 SPHERE = Tip("sphere", RADIUS)
 LARGE = (LargeDeformation(),)
-FAST = 5e-3  # in a period: 5 m/s [m]
+FAST = 5e-3  # way in a period at 5 m/s [m]
 
 
 def stiffest(data: ContactData) -> float:
-    """Largest stiffness K of the organ under a tip [N/m]."""
+    """Return the largest stiffness K of the organ under a tip [N/m]."""
     return 1.0 / float(data.model.arrays.self_compliance[data.model.arrays.row >= 0].min())
 
 
@@ -62,7 +62,7 @@ def stiffest(data: ContactData) -> float:
 def test_the_force_is_the_derivative_of_the_energy(
     bent: Vademecum, tip: Tip, effects: tuple[Effect, ...]
 ) -> None:
-    """On a curved organ, where the compliance beside the dent changes from place to place."""
+    """The organ is curved: its compliance beside the dent varies with position."""
     data = prepare(bent, (tip,), cloud="off", effects=effects)
     rng = np.random.default_rng(2)
     for j in rng.choice(inner_positions(bent), 5):
@@ -100,7 +100,7 @@ def test_tips_that_share_an_organ_conserve_energy(
 
 @pytest.mark.parametrize(("nu", "depth"), [(0.1, 3e-3), (0.48, 3e-3), (0.48, 9e-3)])
 def test_at_large_strain_a_change_of_stiffness_has_its_force(nu: float, depth: float) -> None:
-    """Along the surface only the change of the stored energy with E* has a force."""
+    """Along the surface only the change of the stored energy with E* gives a force."""
     dent = PATCH / (E_STAR * PATCH_RADIUS)  # an organ whose only compliance is that of the dent
     data = flat_organ(compliance=dent, tip=SPHERE, neo_hookean=nu)
     local = data.model.arrays.law.local[STIFFNESS]
@@ -117,12 +117,12 @@ def test_at_large_strain_a_change_of_stiffness_has_its_force(nu: float, depth: f
 
 
 def closed_path_work(v: Vademecum, data: ContactData, n_paths: int, seed: int) -> float:
-    """Largest |work| / peak energy over loops that start and end 15 mm above the organ.
+    """Return the largest |work| / peak energy over loops that start and end 15 mm off the organ.
 
     A loop that only grazes the organ leaves it within a step or two, which the trapezoidal rule
-    does not resolve; a loop that stands out is integrated again, twenty times finer. Where the
-    organ folds, 15 mm above one part may lie within another: such a loop is left out, since a tip
-    that begins inside has no force until it has come out.
+    does not resolve; an outlier is therefore integrated again, twenty times finer. Where the organ
+    folds, 15 mm above one part may lie within another. Such a loop is left out: a tip that begins
+    inside has no force until it has come out.
     """
     rng = np.random.default_rng(seed)
     inner = inner_positions(v, 20e-3)
@@ -143,7 +143,7 @@ def closed_path_work(v: Vademecum, data: ContactData, n_paths: int, seed: int) -
 
 
 def closed_path(v: Vademecum, position: int, rng: np.random.Generator) -> np.ndarray:
-    """Down from above a load position, along four random corners around it, and back up."""
+    """Return a path from above a load position, around it by four random corners, and back."""
     center, n = v.surface.centers[position], v.surface.normals[position]
     corners = center + RADIUS * n + rng.uniform(-12e-3, 12e-3, (4, 3))
     corners += np.outer(-((corners - center) @ n) + RADIUS, n)
@@ -176,7 +176,7 @@ def test_grazing_has_no_steps_and_costs_nothing(spot: Spot, turn: float, depth: 
     assert (loop.status == Status.OK).all()
     size, stiff = np.linalg.norm(loop.force, axis=2), stiffest(data)
     jump = np.linalg.norm(np.diff(loop.force, axis=0), axis=2).max()
-    # the force turns with the surface, curved over no less than the patch's 12 mm, too
+    # the force turns with the surface, whose radius is at least the patch's 12 mm, too
     assert jump <= stiff * h * 1.5 + size.max() * h / 3e-3
     peak = 0.5 * size.max() ** 2 / stiff
     touches = np.abs(np.diff((size > 0.0).astype(int), axis=0)).sum()
@@ -185,7 +185,7 @@ def test_grazing_has_no_steps_and_costs_nothing(spot: Spot, turn: float, depth: 
 
 @pytest.mark.long
 def test_tool_larger_than_a_small_liver() -> None:
-    """40 mm across on a liver of 29 mm: bounded, conservative, and let go as it was."""
+    """40 mm across on a liver of 29 mm: forces are bounded, conservative, and end at zero."""
     scale, radius = 0.15, 20e-3
     data = liver_model(radius=radius, scale=scale)
     size = float(np.ptp(liver(scale).mesh.vertices, axis=0).max())
@@ -199,7 +199,7 @@ def test_tool_larger_than_a_small_liver() -> None:
         for tip in path[::10]:
             step(data, tip)
             depth = max(0.0, -data.state.gap[0]) if data.state.active[0] else 0.0
-            # no softer than a punch that touches all over
+            # no softer than a punch in contact all over
             law = data.state.law
             left = data.state.self_compliance[0] - law.value[0, TAKEN]
             left += 0.5 / (law.value[0, STIFFNESS] * radius)
@@ -210,7 +210,7 @@ def test_tool_larger_than_a_small_liver() -> None:
             peak = max(peak, loop.energy.max())
             worst = max(worst, abs(loop.work[-1]) / loop.energy.max())
     assert peak > 1e-4
-    assert worst < 0.01  # as claimed of any closed path
+    assert worst < 0.01  # as claimed for any closed path
     with pytest.raises(SceneError, match=r"radius is 0\.025"):
         prepare(liver(scale), (Tip("sphere", 25e-3),))
 
@@ -220,7 +220,7 @@ def test_tool_larger_than_a_small_liver() -> None:
 
 @cache
 def bare_flat_organ() -> ContactData:
-    """Compiled when a test wants it and not when tests are collected."""
+    """Build the organ when a test wants it, not when tests are collected."""
     return flat_organ()
 
 
@@ -228,7 +228,7 @@ def bare_flat_organ() -> ContactData:
 @given(start=st.floats(1e-4, 5e-3), slope=st.floats(-1.0, 1.0), periods=st.integers(1, 5))
 @example(start=2.5e-3, slope=0.0, periods=1)
 def test_push_at_5_m_per_s(start: float, slope: float, periods: int) -> None:
-    """Into a flat organ, aslant, and back out."""
+    """Into a flat organ at an angle, and back out."""
     data = bare_flat_organ()
     data.reset()
     way = FAST * np.array([slope, 0.0, -1.0]) / np.hypot(1.0, slope)
@@ -239,11 +239,11 @@ def test_push_at_5_m_per_s(start: float, slope: float, periods: int) -> None:
     depth = np.maximum(0.0, FLAT_RADIUS - path[:, 0, 2])
     pressed = loop.force[:, 0, 2]
     np.testing.assert_allclose(pressed, depth / COMPLIANCE, rtol=1e-6, atol=1e-6)
-    # the slopes of the splines sum to zero but for their rounding, 1.4e-12 at the worst of 400
+    # the slopes of the splines sum to zero except for rounding, 1.4e-12 at worst in 400
     assert np.abs(loop.force[:, 0, 0]).max() < 1e-11 * max(1.0, pressed.max())
     missed = loop.work[periods] - 0.5 * depth[periods] ** 2 / COMPLIANCE
     assert -1e-9 <= missed <= way[2] ** 2 / COMPLIANCE / 8.0 * (1.0 + 1e-6)
-    # what the rule takes in excess on the way in, it gives back on the way out
+    # the rule's excess on the way in is returned on the way out
     assert abs(loop.work[-1]) < 1e-9
     step(data, AWAY[None])
     assert not data.out.force.any()
@@ -255,7 +255,7 @@ SLOWER = 50
 @examples(40, least=16)
 @given(spot=any_spot(30e-3), turn=st.floats(0.0, 2 * np.pi), depth=st.floats(1e-3, 5e-3))
 def test_slide_at_5_m_per_s(spot: Spot, turn: float, depth: float) -> None:
-    """The forces are those of a slow slide, and held poses; the work is what the organ stores."""
+    """Forces equal those of a slow slide and of held poses; work equals the stored energy."""
     data, heading = liver_model(), np.array([np.cos(turn), np.sin(turn)])
     ends = [spot.tip(depth, *(x * heading)) for x in (-20e-3, 20e-3)]
     h = FAST / SLOWER
@@ -274,7 +274,7 @@ def test_slide_at_5_m_per_s(spot: Spot, turn: float, depth: float) -> None:
 
 
 def rule_error(data: ContactData, force: np.ndarray, h: float) -> float:
-    """Of the trapezoidal rule: K h^2 / 8 for each touch, and h^3 / 12 F'' a step [J].
+    """Return the trapezoidal rule's error: K h^2 / 8 per touch, and h^3 / 12 F'' per step [J].
 
     F'' <= K / 12 mm on a surface that the patch of 12 mm rounds.
     """

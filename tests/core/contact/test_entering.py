@@ -1,7 +1,7 @@
 """Tips that come into contact, leave it, leap or have no pose.
 
-A contact gives back the energy that went into it. So a tip that did not come in through the
-surface gets no force, and one that leaps comes in anew.
+A contact returns the energy that went into it. So a tip that did not come in through the surface
+gets no force, and after a leap a tip must come in again.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def test_tip_that_starts_inside_gets_no_force_before_it_has_left(
 
 @pytest.mark.long
 def test_push_through_the_organ_at_5_m_per_s() -> None:
-    """The force grows with the depth; beyond 25 mm, and once barred, it is none."""
+    """The force grows with the depth; beyond 25 mm, and once barred, there is none."""
     data, spot = liver_model(), spots()[0]
     stiff = 1.0 / float(data.model.arrays.self_compliance[data.model.arrays.row >= 0].min())
     path = line(spot.tip(-2e-3), spot.tip(RADIUS + 60e-3), FAST * 1e-3)
@@ -68,14 +68,15 @@ def test_push_through_the_organ_at_5_m_per_s() -> None:
     depth = [-evaluate(f.distance, f.origin, f.spacing[0], p[0], unused, 1.0) for p in path]
     assert not size[np.array(depth) > MAX_DEPTH].any()
     barred = (push.status[:, 0] == Status.OUT_OF_RANGE) & (size == 0.0)
-    assert barred.any()  # the organ is thinner than 25 mm in places, and its wall is met instead
+    # the organ is thinner than 25 mm in places, and the tip meets its other wall
+    assert barred.any()
     assert not size[barred.argmax() :].any()
 
 
 @pytest.mark.parametrize("far", [20e-3, 0.9 * LEAP, 0.5], ids=["20 mm", "45 mm", "0.5 m"])
 @pytest.mark.parametrize("effects", [(), (FRICTION,)], ids=["bare", "friction"])
 def test_release_at_full_load(effects: tuple[Effect, ...], far: float) -> None:
-    """In a period there is no force, no contact and no displacement left, to the bit."""
+    """After one period no force, contact or displacement is left, to the bit."""
     data, spot = liver_model(effects), spots()[0]
     press_in(data, spot, RADIUS + 15e-3)
     cloud, rest = data.out.cloud, data.model.arrays.rest[:, :3]
@@ -120,7 +121,7 @@ def test_a_leap_between_two_touches_drags_nothing_along() -> None:
 
 @pytest.mark.parametrize("effects", SELECTIONS.values(), ids=SELECTIONS)
 def test_invalid_pose_is_forgotten_at_once(effects: tuple[Effect, ...]) -> None:
-    """Deep in the organ, one broken pose costs one period without force, and what stuck."""
+    """Deep in the organ, one broken pose costs one period without force, and the sticking point."""
     spot, bare = spots()[0], liver_model()
     press_in(bare, spot, RADIUS + 10e-3)
     before = bare.out.force.copy()
@@ -131,14 +132,15 @@ def test_invalid_pose_is_forgotten_at_once(effects: tuple[Effect, ...]) -> None:
         assert not data.out.force.any() and data.out.n_contacts[0] == 0
         assert step(data, spot.tip(RADIUS + 10e-3)[None]) == Status.OK
         off = float(np.abs(data.out.force - before).max() / np.abs(before).max())
-        # without memory nothing has passed; of one, up to g / tau a second in 17 periods of entry
+        # without memory nothing has passed; with it, up to g / tau per second in 17 periods of
+        # entry
         assert off <= (0.5 / 0.2 * 17e-3 if effects == SELECTIONS["viscoelastic"] else 1e-6)
         assert np.isfinite(data.out.cloud).all()
 
 
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
 def test_invalid_poses_open_no_door(broken: float) -> None:
-    """Neither to a tip that is barred, nor to one that went on into the organ unseen."""
+    """They open none for a barred tip, nor for one that went on into the organ unseen."""
     spot, lost = spots()[0], np.full((1, 3), broken)
     data = liver_model()
     for depth in (RADIUS + 10e-3, RADIUS + 3e-3):
@@ -152,7 +154,7 @@ def test_invalid_poses_open_no_door(broken: float) -> None:
         step(data, lost)
     assert step(data, spot.tip(RADIUS + 12e-3)[None]) == Status.OUT_OF_RANGE
     assert not data.out.force.any()
-    # as deep as a contact may begin it comes in anew
+    # as deep as a contact may begin, it comes in again
     data.reset()
     press_in(data, spot, 1e-3)
     step(data, lost)

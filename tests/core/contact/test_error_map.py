@@ -1,4 +1,4 @@
-"""The expected error of the force over the surface of an organ."""
+"""Expected error of the force over the surface of an organ."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FACTOR, FLOOR = 2.0, 0.01
 
 
 def test_the_error_is_known_on_the_accessible_surface_alone() -> None:
-    """At least factor times floor, twice as much for twice the factor; NaN below the organ."""
+    """It is at least factor times floor, doubles with the factor, and is NaN below the organ."""
     places = np.stack([top("cube"), top("cube") - 0.2 * UP])
     found = []
     for factor in (FACTOR, 2.0 * FACTOR):

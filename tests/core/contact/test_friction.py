@@ -1,4 +1,4 @@
-"""Stick and slip against closed forms, and the energy that friction takes."""
+"""Stick and slip against closed forms, and the energy that friction dissipates."""
 
 from __future__ import annotations
 
@@ -32,8 +32,10 @@ from tests.helpers.tool_motion import follow
 def test_a_dragged_tip_sticks_up_to_the_static_limit_and_slips_with_the_kinetic_force(
     compliance: float,
 ) -> None:
-    """On the flat organ: tau = x / C until mu_s F_n, then mu_k F_n, against the motion; back, the
-    tip sticks again."""
+    """On the flat organ tau = x / C up to mu_s F_n, then mu_k F_n against the motion.
+
+    On the way back the tip sticks again.
+    """
     mu_s, mu_k, depth = 0.5, 0.3, 4e-3
     data = flat_organ((Friction(mu_s, mu_k),), compliance=compliance)
     normal = depth / compliance
@@ -73,14 +75,14 @@ def test_a_turning_tool_drags_the_tissue_along() -> None:
 
 
 def test_a_small_contact_gives_way_sideways_as_mindlins() -> None:
-    """tau / shift of a sticking sphere: the organ's compliance beside the dent, and 1 / (8 G a)."""
+    """Compare tau / shift of a sticking sphere with the organ's compliance plus 1 / (8 G a)."""
     tip = Tip("sphere", RADIUS)
     data, depth, shift = flat_organ((Friction(1.0, 1.0),), tip=tip), 2e-3, 1e-5
     for _ in range(3):
         force = force_at_depth(data, depth)
     force_at_depth(data, depth, shift)
     tau = -float(data.out.force[0, 0])
-    patch = PATCH / (E_STAR * PATCH_RADIUS)  # the compliance that the dent stands for
+    patch = PATCH / (E_STAR * PATCH_RADIUS)  # the compliance that the dent replaces
     dent = depth - (COMPLIANCE - patch) * force
     a = brentq(lambda a: a * np.arctanh(a / RADIUS) - dent, 1e-9, RADIUS * 0.999)
     rho = (2.0 - MATERIAL.poisson_ratio) / (2.0 * (1.0 - MATERIAL.poisson_ratio))
@@ -92,13 +94,13 @@ def test_a_small_contact_gives_way_sideways_as_mindlins() -> None:
 
 
 def drag(spot: Spot, n: int = 60) -> np.ndarray:
-    """Into the liver and along it, shape (n, 1, 3)."""
+    """Return a path into the liver and along it, shape (n, 1, 3)."""
     t = np.linspace(0.0, 1.0, n)
     return np.array([spot.tip(6e-3 * min(2 * each, 1.0), 4e-3 * each)[None] for each in t])
 
 
 def test_without_coefficients_friction_is_none() -> None:
-    """mu = 0 gives the frictionless force, found in another way, to single precision."""
+    """mu = 0 gives the frictionless force by another solver, to single precision."""
     path = drag(spots()[0])
     bare = follow(liver_model(), path).force
     smooth = follow(liver_model((Friction(0.0, 0.0),)), path).force
@@ -111,7 +113,8 @@ def test_without_coefficients_friction_is_none() -> None:
 def test_what_sticks_gives_back_what_it_got(shape: str, least: float, most: float) -> None:
     """The force of a patch that never slips is the derivative of the energy, to 1 in 1,000.
 
-    A contact that grows and shrinks under a tangential force loses some of it, as Mindlin's does.
+    A contact that grows and shrinks under a tangential force loses some of its energy, as
+    Mindlin's does.
     """
     data = liver_model((Friction(1.0, 1.0),), radius=10e-3, shape=shape)  # type: ignore[arg-type]
     spot, angle = spots()[len(spots()) // 2], np.linspace(0.0, 2 * np.pi, 400)
@@ -145,7 +148,7 @@ def test_friction_takes_energy_on_every_loop(n_loops: int) -> None:
 
 
 def random_loop(rng: np.random.Generator, n: int = 150) -> np.ndarray:
-    """Starts and ends above the organ; goes 1 to 5 mm deep and up to 8 mm to all sides."""
+    """Return a loop from above the organ, 1 to 5 mm deep, with up to 8 mm to all sides."""
     spot, t = spots()[rng.integers(len(spots()))], np.linspace(0.0, 2.0 * np.pi, n)
     depth = -1.5e-3 + (1.5e-3 + rng.uniform(1e-3, 5e-3)) * np.sin(t / 2.0) ** 2
     a = rng.uniform(-8e-3, 8e-3, 4)

@@ -1,4 +1,4 @@
-"""A jaw that closes, pulls and lets go: its law, its energy, and what it does to other tools."""
+"""A jaw that closes, pulls and lets go: its law, its energy, and its effect on other tools."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from avatar_core.vademecum.model import Vademecum
 from tests.helpers.coarse_liver import RADIUS, Spot, liver, spots
 
 OPEN, SHUT = np.array([False]), np.array([True])
-ABOVE = 0.5e-3  # of a jaw that closes over the surface [m]
+ABOVE = 0.5e-3  # height of a jaw that closes over the surface [m]
 
 
 def jaw_of(slip: float = 100.0, radius: float = 3e-3) -> Tip:
@@ -24,7 +24,7 @@ def jaw_of(slip: float = 100.0, radius: float = 3e-3) -> Tip:
 def holding(
     spot: Spot, tip: Tip | None = None, effects: tuple[Effect, ...] = (Grasp(),)
 ) -> tuple[ContactData, np.ndarray]:
-    """A tool that has closed its jaw over a spot, and where it is, shape (1, 3) [m]."""
+    """Close a tool's jaw over a spot; return the data and the tool's place, shape (1, 3) [m]."""
     data = model_of(liver(), (tip or jaw_of(),), effects=effects).data()
     at = spot.tip(-ABOVE)[None]
     step(data.model, data, at, None, OPEN)
@@ -50,7 +50,7 @@ def test_a_jaw_that_closes_pulls_nothing_and_then_like_a_spring() -> None:
 
 
 def test_a_jaw_that_closes_while_it_presses_lets_the_pressure_go() -> None:
-    """Going on from it, a disc stiffer than the tip would give back more than was put in."""
+    """If it went on, a disc stiffer than the tip would return more energy than was put in."""
     data = model_of(liver(), (jaw_of(),), effects=(Grasp(),)).data()
     for depth in (-1e-3, 1e-3, 3e-3):
         step(data.model, data, middle().tip(depth)[None], None, OPEN)
@@ -69,7 +69,8 @@ def test_the_stiffness_is_that_of_the_organ_and_of_a_bonded_disc() -> None:
         data, _ = holding(spot, jaw_of(radius=radius))
         inverse.append(np.linalg.inv(data.state.grasp.stiffness[0]))
     n = data.state.normal[0]
-    assert abs(data.state.law.shape[0]) > 1e-3  # of the tip: a disc is as large on a curved surface
+    # the tip's curvature correction; a disc is as large on a curved surface
+    assert abs(data.state.law.shape[0]) > 1e-3
     less = (inverse[0] - inverse[1]) / (1.0 / 2e-3 - 1.0 / 4e-3)
     t = np.cross(n, np.eye(3)[np.argmin(abs(n))])
     t /= np.linalg.norm(t)
@@ -91,7 +92,7 @@ def test_no_closed_path_gains_energy() -> None:
 
 
 def test_two_graspers_feel_each_other_alike() -> None:
-    """By Maxwell: what a pull of one does to the other is what the other's does to it."""
+    """Maxwell: a pull of one tool acts on the other as the other's on it."""
     one, other = (
         spots()[3],
         min(spots(), key=lambda spot: abs(np.linalg.norm(spot.center - spots()[3].center) - 25e-3)),
@@ -114,7 +115,7 @@ def test_two_graspers_feel_each_other_alike() -> None:
 
 
 def test_a_tool_beside_presses_into_tissue_that_is_held() -> None:
-    """A held point beside a push does not give way as the free one does, and feels it."""
+    """A held point beside a push yields less than a free one, and bears a force."""
     spot = spots()[3]
     other = min(spots(), key=lambda s: abs(np.linalg.norm(s.center - spot.center) - 20e-3))
     data = model_of(liver(), (jaw_of(), Tip("sphere", RADIUS)), effects=(Grasp(), SeveralTools()))

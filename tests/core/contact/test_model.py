@@ -20,7 +20,7 @@ EFFECTS = (Friction(), Viscoelasticity((0.3,), (0.1,)), Inertia())
 
 @pytest.fixture(scope="module")
 def paths(phantom_vademecum: Vademecum) -> list[np.ndarray]:
-    """Of two tools far apart, each shape (n, 1, 3)."""
+    """Return the paths of two distant tools, each of shape (n, 1, 3)."""
     starts = starts_apart(phantom_vademecum, 2)
     made = (push_and_slide(phantom_vademecum, RADIUS, 5e-3, 3e-3, N, at) for at in starts)
     return [path[:, None] for path in made]
@@ -32,7 +32,7 @@ def model(phantom_vademecum: Vademecum) -> ContactModel:
 
 
 def follow(data: ContactData, path: np.ndarray) -> np.ndarray:
-    """Forces along a path, and the last cloud, in one row."""
+    """Return the forces along a path, and the last cloud, in one row."""
     force = np.empty(path.shape)
     for k, tips in enumerate(path):
         step(data.model, data, tips)

@@ -1,4 +1,4 @@
-"""How a tool turns, against scipy's rotations."""
+"""Orientation of a tool, against scipy's rotations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SHAFT = np.array([0.6, 0.0, -0.8])
 
 
 def turned(*orientations: np.ndarray) -> SimpleNamespace:
-    """What a step knows of a tool after these orientations."""
+    """Return the state of a tool after these orientations."""
     on = SimpleNamespace(on=True, shaft=SHAFT)
     model = SimpleNamespace(friction=on, tilt=on)
     rows = {name: np.zeros((1, n)) for name, n in (("before", 4), ("spin", 3), ("axis", 3))}
@@ -25,7 +25,7 @@ def turned(*orientations: np.ndarray) -> SimpleNamespace:
 
 
 def test_a_small_turn_is_its_rotation_vector() -> None:
-    """Whichever of its two quaternions an orientation has."""
+    """Either of an orientation's two quaternions gives the same."""
     rng = np.random.default_rng(0)
     for _ in range(20):
         before, vector = Rotation.random(random_state=rng), rng.normal(size=3) * 0.01

@@ -23,11 +23,11 @@ from tests.helpers.flat_organ import COMPLIANCE, at_depth, flat_organ
 from tests.helpers.tool_motion import AWAY
 
 often = examples(40, least=16)
-CLOSED = 2e-9  # the tolerance of a gap, and of its neighbours' [m]
+CLOSED = 2e-9  # tolerance of a gap, and of its neighbours' [m]
 
 
 def complementarity(data: ContactData) -> float:
-    """Of Signorini: deepest penetration, or largest gap under a force [m]."""
+    """Return the violation of Signorini's conditions: penetration, or gap under a force [m]."""
     s, law = data.state, data.state.law
     active = np.flatnonzero(s.active)
     left = s.gap[active] + s.compliance[np.ix_(active, active)] @ s.force[active]
@@ -82,7 +82,7 @@ def test_tools_in_one_place_press_as_one(
         x, y = rng.uniform(-aside, aside, 2) if t else (0.0, 0.0)
         tips[t] = spot.tip(depth + deeper * t / n_tools, x, y)
     data, one = liver_model(n_tools=8, shape=shape), liver_model(shape=shape)
-    single = np.zeros((n_tools, 2))  # force and energy of each tool by itself
+    single = np.zeros((n_tools, 2))  # force and energy of each tool alone
     for t in range(n_tools):
         one.reset()
         step(one, tips[t : t + 1])
@@ -91,12 +91,12 @@ def test_tools_in_one_place_press_as_one(
     assert complementarity(data) < CLOSED
     c = data.state.compliance[:n_tools, :n_tools]
     np.testing.assert_array_equal(c, c.T)
-    # coupled, none is pressed harder than by itself; all together store more than any of them
+    # coupled, none is pressed harder than alone; all together store more than any of them
     force = data.state.force[:n_tools]
     assert (force >= 0.0).all() and (force <= single[:, 0] * (1.0 + 1e-6)).all()
     assert stored_energy(data) >= single[:, 1].max() * (1.0 - 1e-6)
-    # as stiff as one contact, and stiffer only by what they are apart; spheres, which cannot be in
-    # one place, dent the tissue each on its own
+    # as stiff as one contact, and stiffer only by their distance; spheres, which cannot be in
+    # one place, dent the tissue separately
     total = force.sum() / single[:, 0].max()
     if shape == "sphere":
         assert total > 1.0 - 1e-6
@@ -106,7 +106,7 @@ def test_tools_in_one_place_press_as_one(
 
 @pytest.mark.parametrize("radii", [(RADIUS, RADIUS + 1e-6), (RADIUS + 1e-6, RADIUS)])
 def test_two_radii_around_one_centre(radii: tuple[float, float]) -> None:
-    """The larger sphere alone touches, whatever the order; sweeps alone would take thousands."""
+    """Only the larger sphere touches, in any order; sweeps alone would take thousands."""
     arrays = flat_organ((SeveralTools(),)).model.arrays
     data = data_of(arrays._replace(tip_offset=np.array(radii)))
     larger, centre = int(np.argmax(radii)), at_depth(8e-3)[0]
@@ -120,7 +120,7 @@ def test_two_radii_around_one_centre(radii: tuple[float, float]) -> None:
 
 @cache
 def stiffened(stiffness: float) -> ContactData:
-    """The liver with eight tools and a Young's modulus that gives this mean stiffness [N/m]."""
+    """Return the liver with eight tools and a Young's modulus for this mean stiffness [N/m]."""
     soft, single = liver_model(n_tools=8), np.float32
     arrays = soft.model.arrays
     factor = stiffness * float(arrays.self_compliance[arrays.row >= 0].mean())
@@ -158,7 +158,7 @@ def test_very_stiff_organs_stay_complementary(
     assert not is_shared or (s.force > 0.0).sum() > 1
     work = -0.5 * s.force @ np.where(s.active, s.gap, 0.0)
     assert stored_energy(data) == pytest.approx(work, rel=1e-5)
-    # not even a million newton a metre moves more than the tip is deep
+    # even a million newton per metre moves no more than the tip's depth
     assert np.abs(data.out.cloud[:, 3:]).max() < 3.0 * -s.gap[s.active].min()
 
 
@@ -168,7 +168,7 @@ def test_very_stiff_organs_stay_complementary(
 def test_compliance_between_tips_is_symmetric_positive_definite(
     phantom_vademecum: Vademecum,
 ) -> None:
-    """Of 2 to 8 tips at random places."""
+    """2 to 8 tips at random places."""
     v, rng, seen = phantom_vademecum, np.random.default_rng(0), 0
     data = prepare(v, (Tip("sphere", RADIUS),) * 8, cloud="off")
     faces = v.surface.corners
@@ -197,7 +197,7 @@ def test_compliance_between_tips_is_symmetric_positive_definite(
 @pytest.mark.long
 @pytest.mark.parametrize("mu", [0.4, 1.0])
 def test_tools_side_by_side_with_friction_converge(mu: float) -> None:
-    """Pressed down and dragged, each a little its own way, 0 to 5 mm apart."""
+    """Pressed down and dragged in slightly different directions, 0 to 5 mm apart."""
     friction = Friction(static=mu, kinetic=0.8 * mu)
     data, spot, lost, n = liver_model((friction,), 2), spots(30e-3)[0], 0, 0
     for aside in (0.0, 1e-5, 1e-4, 3e-4, 1e-3, 2e-3, 5e-3):
@@ -218,5 +218,5 @@ def test_tools_side_by_side_with_friction_converge(mu: float) -> None:
                 across = np.linalg.norm(push + pressed[:, None] * normal, axis=1)
                 assert (across <= mu * pressed * (1.0 + 1e-9) + 1e-12).all()
                 assert np.linalg.norm(push, axis=1).max() < 25.0
-    # the solution of some changes from stick to slip is not found: documented, rare
+    # some changes from stick to slip are not solved: documented, rare
     assert lost <= 0.001 * n

@@ -34,7 +34,7 @@ def at_depth(v: Vademecum, depth: float, position: int | None = None) -> np.ndar
 
 
 def test_force_of_a_patch_equals_full_finite_elements(phantom_vademecum: Vademecum) -> None:
-    """lambda = indentation / (n . C n), C from fresh solves, as well as the certificate says."""
+    """lambda = indentation / (n . C n) with C from fresh solves, within the certified error."""
     v, patch = phantom_vademecum, prepare(phantom_vademecum, (PATCH,), cloud="volume")
     problem = Elasticity(v.mesh, v.material, v.regions.clamped)
     errors = []
@@ -96,10 +96,10 @@ def test_force_of_a_ball_points_out_of_it_whatever_the_radius(
 def force_steps(
     v: Vademecum, data: ContactData, depth: float, position: int | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Force steps over 200 mm at constant depth, 0.1 mm each, in size alone and in all; and 0.01
-    mm where it changes most.
+    """Return force changes per 0.1 mm over 200 mm at constant depth, in size and as vectors.
 
-    All as part of the peak, and the peak [N].
+    They are followed by the changes per 0.01 mm at the largest one. All are relative to the peak;
+    the last value is the peak [N].
     """
     path = slide(v, RADIUS, depth, 0.2, position=position)
     forces = forces_along(data, path)
@@ -113,7 +113,7 @@ def force_steps(
 
 
 def forces_along(data: ContactData, path: np.ndarray) -> np.ndarray:
-    """Force on a tip that goes along a path, without a step that fails, shape (n, 3) [N]."""
+    """Return the force on a tip along a path, without a failed step, shape (n, 3) [N]."""
     data.reset()
     motion = follow(data, path[:, None])
     assert (motion.status == Status.OK).all()
@@ -133,10 +133,11 @@ def test_sliding_force_has_no_steps(phantom_vademecum: Vademecum, depth: float) 
 @pytest.mark.long
 @pytest.mark.parametrize("depth", [2e-3, 5e-3])
 def test_sliding_force_on_real_livers_has_no_steps(real_vademecum: Vademecum, depth: float) -> None:
-    """99 % change by less than 2 % of the peak per 0.1 mm, besides turning as the surface does.
+    """99 % change by less than 2 % of the peak per 0.1 mm, besides turning with the surface.
 
-    Facets meet at edges, over which the normal turns by up to 0.05 a step and the force with it. A
-    slope, walked ten times finer, changes by a tenth per step; a step by all of it.
+    Facets meet at edges, over which the normal turns by up to 0.05 per step, and the force with it.
+    On a path ten times finer, a slope changes by a tenth per step, but a discontinuity by all of
+    it.
     """
     v, data = real_vademecum, prepare(real_vademecum, (SPHERE,))
     others = np.random.default_rng(3).choice(inner_positions(v, 20e-3), 4, replace=False)
@@ -207,7 +208,7 @@ def test_forces_come_before_the_cloud(phantom_vademecum: Vademecum) -> None:
 
 
 def test_the_step_cannot_allocate() -> None:
-    """Whoever writes an array into it is told when it compiles."""
+    """Code that writes an array into it fails to compile."""
     import numba
 
     from avatar_core.common.jit import entry

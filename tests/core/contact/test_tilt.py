@@ -1,4 +1,4 @@
-"""A flat punch that leans: against the closed form, its own energy, and resolved contact."""
+"""A tilted flat punch: against the closed form, its own energy, and resolved contact."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ PUNCH = Tip("flat", 5e-3)
 
 
 def towards(axis: np.ndarray) -> np.ndarray:
-    """An orientation whose shaft has this direction, shape (1, 4)."""
+    """Return an orientation whose shaft has this direction, shape (1, 4)."""
     return turning(np.array(Tilt().axis), axis)
 
 
 def leaning(angle: float, about: float = 0.0) -> np.ndarray:
-    """That of a tool that leans off the flat organ's normal, in a direction [rad]."""
+    """Return the orientation of a tool tilted off the normal, in a direction [rad]."""
     s = np.sin(angle)
     return towards(np.array([s * np.cos(about), s * np.sin(about), np.cos(angle)]))
 
 
 def pressed(angle: float, depth: float, about: float = 0.0, *effects: Effect) -> ContactData:
-    """The flat organ after such a tool has approached it, its face's centre to a depth."""
+    """Return the flat organ after such a tool has approached, its face's centre to a depth."""
     data = flat_organ((Tilt(), *effects), tip=PUNCH)
     for at in np.linspace(-3e-3, depth, 50):
         step(data, at_depth(at, offset=0.0), leaning(angle, about))
@@ -98,7 +98,7 @@ def test_force_and_torque_are_the_derivatives_of_the_energy(
 
 
 def energy_turn(data: ContactData, place: np.ndarray, h: float = 1e-4) -> np.ndarray:
-    """Derivative of the stored energy by a rotation of the tool, shape (3,) [N m]."""
+    """Differentiate the stored energy by a rotation of the tool, shape (3,) [N m]."""
     axis, energy = data.state.axis[0].copy(), []
     for change in h * np.concatenate([np.eye(3), -np.eye(3)]):
         turned = axis + np.cross(change, axis)
@@ -109,7 +109,7 @@ def energy_turn(data: ContactData, place: np.ndarray, h: float = 1e-4) -> np.nda
 
 @pytest.mark.long
 def test_torque_relaxes_and_friction_leaves_it() -> None:
-    """In the end that of the relaxed modulus; on the face itself friction has no arm."""
+    """In the end it is that of the relaxed modulus; friction on the face itself has no lever."""
     soft = Viscoelasticity((0.6,), (0.02,))
     data, elastic = pressed(0.02, 2e-3, 0.0, soft), pressed(0.02, 2e-3)
     for _ in range(400):
@@ -122,10 +122,10 @@ def test_torque_relaxes_and_friction_leaves_it() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(("angle", "bound"), [(0.05, 0.04), (0.2, 0.08)])
 def test_force_and_torque_are_those_of_resolved_contact(angle: float, bound: float) -> None:
-    """On a cube, of a face that touches all over and of one that has partly lifted off.
+    """On a cube, for a face that touches all over and for one that has partly lifted off.
 
-    The reference presses along the tool's axis on elements that make both 1.6 % too large; small
-    angles are the theory's.
+    The reference presses along the tool's axis on elements that make both 1.6 % too large; the
+    theory holds for small angles.
     """
     up, depth, axis = box_organ.UP, 1e-3, np.array([np.sin(angle), np.cos(angle), 0.0])
     mesh, regions = body_mesh("cube")
@@ -145,7 +145,7 @@ def test_force_and_torque_are_those_of_resolved_contact(angle: float, bound: flo
 
 
 def torque_on_tip(elasticity: Elasticity, loads: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """About a point, of what nodal loads on the organ's boundary do to the tip, (3,) [N m]."""
+    """Return the torque about a point on the tip, from nodal loads on the organ, (3,) [N m]."""
     place = np.zeros((elasticity.n_nodes, 3))
     corner = elasticity.mesh.vertices[elasticity.mesh.boundary_faces]
     middle = 0.5 * (corner + np.roll(corner, -1, axis=1))

@@ -1,4 +1,4 @@
-"""Where a tip presses, and the compliance that it finds there."""
+"""The position where a tip presses, and the compliance there."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ N, SPACING = 24, 2.5e-3
 
 
 def test_a_tip_presses_at_the_point_under_it_however_large_it_is() -> None:
-    """On a ball of 80 faces that stands for a round one, up to 14 mm above: on the radius of the
-    centre. The face closest to the centre itself lies up to 3 mm beside."""
+    """Up to 14 mm above a ball of 80 faces, it lies on the line to the centre of the round ball.
+
+    The face closest to the tip's centre itself lies up to 3 mm beside.
+    """
     mesh, regions = coarse_ball()
     loads = load_surface(mesh, regions, PATCH)
     field = make_tip_field(mesh, regions, PATCH, ball(RADIUS, level=5))

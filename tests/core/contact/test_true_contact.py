@@ -1,9 +1,9 @@
-"""The force of the step against the truth: Sneddon's on boxes, resolved contacts on organs.
+"""The force of the step against references: Sneddon on boxes, resolved contacts on organs.
 
-A cube of 200 mm, clamped below, is a half-space to a tip: its free sides let a patch of 12 mm in
-the middle of its top sink deeper, its clamp less deep, and what is left of both is 0.1 %. Sneddon's
-forces hold as they are. A column of half the width gives way besides: there the depth is Sneddon's
-plus the force times what the patch sinks more than on a half-space, on fine elements.
+A cube of 200 mm, clamped below, acts as a half-space under a tip. Its free sides let a patch of
+12 mm in the middle of its top sink deeper, its clamp less deep; both together leave 0.1 %.
+Sneddon's forces hold as they are. A column of half the width also gives way as a whole. There the
+depth is Sneddon's plus the force times the extra sinking of the patch on fine elements.
 """
 
 from __future__ import annotations
@@ -58,18 +58,19 @@ TIPS = [
     for shape, make in SHAPES.items()
     for radius in RADII
 ]
-ASIDE = ((0.0, 0.0), (3e-3, 2e-3), (-9e-3, 7e-3))  # of the middle, between load positions [m]
-HALF_SPACE = 0.7665 / (MODULUS * PATCH_RADIUS)  # what a patch sinks there [m/N]
+# offsets from the middle, between load positions [m]
+ASIDE = ((0.0, 0.0), (3e-3, 2e-3), (-9e-3, 7e-3))
+HALF_SPACE = 0.7665 / (MODULUS * PATCH_RADIUS)  # compliance of a patch on a half-space [m/N]
 
 
 def depths_of(tip: Tip) -> list[float]:
-    """Those at which the contact does not reach the rim of a cone."""
+    """Return the depths at which the contact does not reach the rim of a cone."""
     rimless = tip.shape in ("sphere", "flat")
     return [depth for depth in DEPTHS if rimless or depth <= tip.radius]
 
 
 def on_top(body: Body, tip: Tip, aside: tuple[float, float]) -> Callable[[float], float]:
-    """The step's force on a tip at a depth in the top of a box."""
+    """Return the step's force on a tip over its depth in the top of a box."""
     data = prepare(organ(body), (tip,), cloud="off", effects=())
     point = top(body) + np.array([aside[0], 0.0, aside[1]])
     return lambda depth: float(press(data, (tip,), point[None], UP[None], (depth,))[0])
@@ -84,7 +85,7 @@ def test_a_tip_feels_sneddons_force_on_a_cube(tip: Tip) -> None:
 
 
 def exact_on_column(tip: Tip, depth: float) -> float:
-    """Sneddon's force where the half-space gives way besides, as much as the column [N]."""
+    """Return Sneddon's force on a half-space that also gives way as the column does [N]."""
     base = patch_compliance("column") - HALF_SPACE
     return on_soft_base(partial(sneddon, tip, modulus=MODULUS), depth, base)
 
@@ -92,7 +93,7 @@ def exact_on_column(tip: Tip, depth: float) -> float:
 @pytest.mark.long
 @pytest.mark.parametrize("tip", TIPS)
 def test_a_tip_on_a_column_feels_it_give_way(tip: Tip) -> None:
-    """The wider a tip, the more it feels that the coarse mesh is stiff: 5.5 % at 10 mm."""
+    """The coarse mesh is too stiff, most for wide tips: 5.5 % at 10 mm."""
     exact = [exact_on_column(tip, depth) for depth in depths_of(tip)]
     force = on_top("column", tip, ASIDE[0])
     limit = 0.01 + 5.0 * tip.radius
@@ -102,7 +103,7 @@ def test_a_tip_on_a_column_feels_it_give_way(tip: Tip) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("radius", [3e-3, 10e-3])
 def test_a_sphere_feels_the_large_strain_of_a_neo_hookean_cube(radius: float) -> None:
-    """As finite elements of the sphere alone say, down to one radius, where it bears 7 % less."""
+    """It agrees with finite elements of the sphere down to one radius, where it is 7 % lower."""
     cube, rule = organ("cube"), LargeRule(max_push=12e-3)
     problem = hyperelastic_problem(cube, "neo-hookean")
     bent = with_large_deformation(cube, problem, "neo-hookean", rule)
@@ -125,7 +126,7 @@ def test_a_patch_sinks_into_the_cube_as_into_a_half_space() -> None:
 def true_force(
     point: tuple[float, ...], normal: tuple[float, ...], radius: float, depth: float
 ) -> float:
-    """Of a resolved contact of a sphere with the coarse phantom [N]."""
+    """Return the force of a sphere's resolved contact with the coarse phantom [N]."""
     surface = phantom_liver(12e-3)
     mesh = tetrahedralize(surface, 800)
     organ_there = (surface, mesh, regions_by_rule(mesh), Material())
@@ -145,7 +146,7 @@ def test_a_tip_on_an_organ_feels_a_resolved_contact(straight: Vademecum) -> None
 
 
 def pairs_of(sites: Sequence[Site]) -> list[tuple[Site, Site]]:
-    """Sites that are 25 mm apart, to 1.5 mm, and face the same way within 30 degrees."""
+    """Pair sites that are 25 mm apart, to 1.5 mm, with normals within 30 degrees."""
     return [
         (first, second)
         for k, first in enumerate(sites)
@@ -157,8 +158,10 @@ def pairs_of(sites: Sequence[Site]) -> list[tuple[Site, Site]]:
 
 @pytest.mark.long
 def test_two_tips_on_the_phantom_feel_resolved_contacts(phantom_vademecum: Vademecum) -> None:
-    """What a tip feels that the other has all but lifted off is the small difference of two depths:
-    it is compared with a tenth of the other's force.
+    """Two tips on the phantom bear the forces of resolved contacts.
+
+    The force on a tip that the other has almost lifted off is a small difference of two depths; its
+    error is compared with a tenth of the other's force.
     """
     v, surface = phantom_vademecum, phantom_liver()
     tips, depths = (Tip("sphere", 3e-3), Tip("sphere", 5e-3)), ((2e-3, 4e-3), (4e-3, 2e-3))
@@ -180,7 +183,7 @@ def test_two_tips_on_the_phantom_feel_resolved_contacts(phantom_vademecum: Vadem
 
 @cached_on_disk
 def true_forces_beside(apart: float, radii: tuple[float, float]) -> tuple[np.ndarray, ...]:
-    """Of two balls on a cube, resolved together, for each of ``BESIDE`` [N]."""
+    """Return the forces of two balls on a cube, resolved together, for each of ``BESIDE`` [N]."""
     mesh, regions = body_mesh("cube")
     points, tips = beside(apart), [Tip("sphere", radius) for radius in radii]
     fine = refined_organ(None, mesh, regions, MATERIAL, points, [UP, UP], tips, np.ravel(BESIDE))
@@ -193,14 +196,14 @@ BESIDE = ((2e-3, 4e-3), (0.8e-3, 4e-3), (4e-3, 2e-3))  # depths of two balls [m]
 
 
 def beside(apart: float) -> np.ndarray:
-    """Two places on the cube, (2, 3) [m]."""
+    """Return two places on the cube, shape (2, 3) [m]."""
     first = top("cube") + np.array([1e-3, 0.0, 2e-3])
     return np.stack([first, first + apart * np.array([0.8, 0.0, 0.6])])
 
 
 @pytest.mark.parametrize("apart", [14e-3, pytest.param(20e-3, marks=pytest.mark.long)])
 def test_a_ball_in_the_dent_of_another_feels_what_is_left(apart: float) -> None:
-    """Down to a quarter of what it would feel alone; a patch's dent would leave it a sixth."""
+    """It falls to a quarter of the force alone; with a patch's dent it would fall to a sixth."""
     radii = (3e-3, 5e-3)
     tips = tuple(Tip("sphere", radius) for radius in radii)
     data = prepare(organ("cube"), tips, cloud="off", effects=(SeveralTools(),))

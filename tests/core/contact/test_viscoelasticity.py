@@ -1,4 +1,4 @@
-"""Relaxation and creep against closed forms, and a dent that fades."""
+"""Relaxation and creep against closed forms, and a fading dent."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PRONY = Viscoelasticity((0.3, 0.2), (0.05, 0.7))
 
 
 def relaxed_force(times: np.ndarray, depths: np.ndarray, t: float) -> float:
-    """f(t) = int g(t - t') d(depth)/C for a motion that is linear between its corners."""
+    """Integrate f(t) = int g(t - t') d(depth)/C for a motion that is linear between corners."""
     g, tau = np.array(PRONY.g), np.array(PRONY.tau)
     force = 0.0
     for t0, t1, d0, d1 in zip(times[:-1], times[1:], depths[:-1], depths[1:], strict=True):
@@ -33,7 +33,7 @@ def relaxed_force(times: np.ndarray, depths: np.ndarray, t: float) -> float:
 @pytest.mark.long
 @pytest.mark.parametrize("period", [0.1e-3, 1e-3, 10e-3])
 def test_relaxation_is_exact_for_motion_in_straight_lines(period: float) -> None:
-    """Down, hold, further down, half back: the closed form to 1e-6 whatever the step."""
+    """Down, hold, further down, half back: the closed form to 1e-6 for any step."""
     times = np.array([0.0, 0.1, 0.5, 0.6, 0.9, 1.0])
     depths = 1e-3 * np.array([0.0, 3.0, 3.0, 4.0, 4.0, 2.0])
     data = flat_organ((PRONY,), period)
@@ -46,11 +46,11 @@ def test_relaxation_is_exact_for_motion_in_straight_lines(period: float) -> None
     assert worst < 1e-6 * peak
 
 
-RAMP = 0.02  # [s] in which the force of the creep test grows
+RAMP = 0.02  # time in which the force of the creep test grows [s]
 
 
 def creep(t: float) -> float:
-    """Depth over C f of the flat organ, t after the start of a ramp to a constant force.
+    """Return depth over C f of the flat organ, t after the start of a ramp to a constant force.
 
     The compliance J(s) = 1 / (s^2 g(s)) of two Maxwell terms by partial fractions, integrated over
     the ramp.
@@ -67,12 +67,12 @@ def creep(t: float) -> float:
 
 
 def crept(period: float, force: float, end: float) -> float:
-    """Depth at the end of a force that grows in RAMP and stays, the tip moved to hold it."""
+    """Return the depth under a force that grows in RAMP and stays, by moving the tip."""
     data = flat_organ((PRONY,), period)
     depth = 0.0
     for k in range(1, round(end / period) + 1):
         wanted = force * min(1.0, k * period / RAMP)
-        # the next step is affine in the depth: two trials, of which the memory knows nothing
+        # the next step is affine in the depth: two trials, which the memory does not note
         found = []
         for trial in (depth + 1e-3, depth + 2e-3):
             before = [array.copy() for array in data.state.viscoelasticity]
@@ -95,7 +95,7 @@ def test_creep_under_a_held_force_is_of_second_order() -> None:
 
 
 def test_an_organ_that_is_let_go_creeps_back() -> None:
-    """Held until relaxed, then let go: e = g e_0 exp(- g_inf t / tau)."""
+    """Held until relaxed, then released: e = g e_0 exp(- g_inf t / tau)."""
     g, tau, period, depth = 0.6, 0.1, 1e-3, 4e-3
     data = flat_organ((Viscoelasticity((g,), (tau,)),))
     first = force_at_depth(data, depth)
@@ -109,7 +109,7 @@ def test_an_organ_that_is_let_go_creeps_back() -> None:
         assert not data.out.force.any()
         left.append(elastic[2] / held)
     expected = g * np.exp(-(1.0 - g) * np.arange(200) * period / tau)
-    # exact for any period but for the first, in which the load goes
+    # exact for any period except the first, in which the load ends
     np.testing.assert_allclose(np.array(left[:200]) / left[0] * g, expected, atol=1e-6)
     assert left[0] == pytest.approx(g, rel=period / tau)
     assert abs(left[-1]) < 1e-10
@@ -127,7 +127,7 @@ def test_a_sphere_relaxes_as_the_tissue_does() -> None:
 
 
 def test_a_history_moves_the_cloud_as_its_loads_do(phantom_vademecum: Vademecum) -> None:
-    """Of soft tissue that was stroked across more regions than are shown in full."""
+    """Soft tissue was stroked across more regions than are shown in full."""
     v, tip = phantom_vademecum, Tip("patch", 8e-3)
     data = prepare(v, (tip,), cloud="volume", effects=(Viscoelasticity((0.9,), (5.0,)),))
     mass, errors = np.repeat(v.mesh.vertex_volumes, 3), []

@@ -1,4 +1,4 @@
-"""A sphere in a half-space by finite elements, against closed forms, and the law fitted to it."""
+"""A sphere on a half-space by finite elements, against closed forms, and the fitted law."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COARSE, COARSER, SMALL = Domain(0.2), Domain(0.4), Domain(0.25, 30.0)
 
 
 def sneddon(depth: float, nu: float) -> float:
-    """F / (E R^2) of a sphere at small strain (Sneddon 1965)."""
+    """Return F / (E R^2) of a sphere at small strain (Sneddon 1965)."""
     a = brentq(lambda a: a * np.arctanh(a) - depth, 0.0, 1.0 - 1e-14)
     return float((0.5 * (a * a + 1.0) * np.log((1.0 + a) / (1.0 - a)) - a) / (1.0 - nu**2))
 
@@ -41,7 +41,7 @@ def test_at_small_strain_the_sphere_is_sneddons() -> None:
 
 
 def test_a_stretched_cylinder_is_in_equilibrium() -> None:
-    """Uniaxial compression of a neo-Hookean cylinder, whose wall bears nothing."""
+    """Uniaxial compression of a neo-Hookean cylinder with a free wall."""
     nu, along, size = 0.45, 0.7, 3.0
     lam, mu = Material(1.0, nu).lame
 
@@ -129,7 +129,7 @@ def test_a_fit_finds_the_law_of_its_data(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def dent_of(tip: Tip, nu: float) -> SimpleNamespace:
-    """What of a tip's law :func:`evaluate_large_dent` reads."""
+    """Return the part of a tip's law that :func:`evaluate_large_dent` reads."""
     law = SimpleNamespace(
         large_dent=large_dent_of(tip, nu, True)[None], radius=np.array([tip.radius])
     )

@@ -1,4 +1,4 @@
-"""Elasticity: elements, incompressibility, contrasts of stiffness, slivers, sizes."""
+"""Elasticity: elements, incompressibility, stiffness contrasts, slivers, sizes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from tests.helpers.elastic_shapes import (
 Figure = Callable[[str], None]
 
 RATIOS = (0.49, 0.499, 0.49999)
-CORK = Material(0.17e6, 0.0)  # which does not contract sideways
+CORK = Material(0.17e6, 0.0)  # does not contract sideways
 
 
 def test_rigid_modes_carry_no_energy() -> None:
@@ -58,7 +58,7 @@ def test_rigid_modes_carry_no_energy() -> None:
 
 
 def test_stiffness_is_that_of_the_vector_form() -> None:
-    """Where half the tetrahedra have no share of the material, as scikit-fem has it on the rest."""
+    """Half the tetrahedra have no material; scikit-fem integrates over the rest."""
     mesh = box_mesh(2)
     grid = MeshTet(mesh.vertices.T, mesh.tets.T)
     share = (np.arange(len(mesh.tets)) % 2).astype(float)
@@ -78,7 +78,7 @@ def test_stiffness_is_that_of_the_vector_form() -> None:
 def test_manufactured_solution_converges_with_third_order() -> None:
     """P2: the L2 error of u = sin(kx) sin(ky) sin(kz) e_x falls by 2^3 when h is halved."""
     errors = [_manufactured_error(n) for n in (3, 6)]
-    assert np.log2(errors[0] / errors[1]) > 2.7  # 3, less what coarse meshes lose
+    assert np.log2(errors[0] / errors[1]) > 2.7  # 3, less the loss on coarse meshes
 
 
 def _manufactured_error(n: int) -> float:
@@ -144,13 +144,13 @@ def test_nearly_incompressible_cube_against_taylor_hood_refined(
     chosen = compliance(clamped_cube(4, nu))
     error = np.linalg.norm(chosen - fine) / np.linalg.norm(fine)
     figure(f"compliance {error:.2%} off")
-    # of which the mesh alone 1.2 % (nu 0.3); linear tetrahedra lose a third and more
+    # 1.2 % of it by the mesh alone (nu 0.3); linear tetrahedra lose a third and more
     assert error < (0.05 if nu <= 0.49 else 0.025)
     assert np.abs(chosen - chosen.T).max() < 1e-9 * np.abs(chosen).max()
 
 
 class Octant(Elasticity):
-    """Held by symmetry: a node in a plane of coordinates slides in it."""
+    """Solid held by symmetry: a node in a plane of coordinates slides in it."""
 
     @cached_property
     def _free(self) -> np.ndarray:
@@ -158,7 +158,7 @@ class Octant(Elasticity):
 
 
 class ThickSphere:
-    """A hollow sphere under inner pressure, and what Lame says of it.
+    """A hollow sphere under inner pressure, and Lame's solution.
 
     u_r = p a^3 / (b^3 - a^3) [(1 - 2 nu) r / E + (1 + nu) b^3 / (2 E r^2)]
     """
@@ -198,7 +198,7 @@ def test_thick_sphere_under_pressure_is_lames(nu: float, figure: Figure) -> None
 
 
 def test_no_pressure_is_unseen_by_taylor_hood(figure: Figure) -> None:
-    """inf over p of sup over u of (p, div u) / |p| |u| stays away from 0 as the mesh is refined."""
+    """inf over p of sup over u of (p, div u) / |p| |u| stays away from 0 under refinement."""
 
     def inf_sup(n: int) -> float:
         problem = clamped_cube(n, element="Taylor-Hood")
@@ -232,7 +232,7 @@ def test_layered_bar_is_a_chain_of_springs(contrast: float, figure: Figure) -> N
     expected = 1e3 * 0.05 * (1.0 + 1.0 / contrast) / CORK.young_modulus * np.eye(3)[1]
     error = np.abs(end - expected).max() / expected[1]
     figure(f"{error:.1e} off the series of springs")
-    # rounding times the condition of the stiffness: that of the mesh, 1e3, and of the contrast
+    # rounding times the condition of the stiffness: 1e3 by the mesh, and the contrast
     assert error < 2.2e-16 * 1e3 * max(contrast, 1.0 / contrast)
 
 
@@ -240,7 +240,7 @@ def test_layered_bar_is_a_chain_of_springs(contrast: float, figure: Figure) -> N
 
 
 def with_caps(mesh: TetMesh, ratio: float) -> TetMesh:
-    """Every fourth tetrahedron cut in four, one of them as flat as 1 : ratio on its base."""
+    """Cut every fourth tetrahedron in four, one of them as flat as 1 : ratio on its base."""
     vertices, tets = [*mesh.vertices], [*mesh.tets.tolist()]
     for tet in mesh.tets[::4].tolist():
         a, b, c, d = mesh.vertices[tet]
@@ -276,7 +276,7 @@ def test_slivers_pass_the_patch_test(ratio: float, nu: float, figure: Figure) ->
 @pytest.mark.parametrize("ratio", [10.0, 100.0])
 @pytest.mark.parametrize("nu", [0.48, 0.4999])
 def test_slivers_leave_the_solution_alone(ratio: float, nu: float, figure: Figure) -> None:
-    """Beside the good mesh, which they only add to: they cannot make the organ stiffer."""
+    """They only add to the good mesh's space, so they cannot make the organ stiffer."""
     mesh, good = with_caps(box_mesh(4), ratio), compliance(clamped_cube(4, nu))
     found = compliance(Elasticity(mesh, Material(poisson_ratio=nu), box_regions(mesh).clamped))
     change = np.linalg.norm(found - good) / np.linalg.norm(good)
@@ -305,14 +305,14 @@ def test_compliance_scales_with_one_over_stiffness_and_size(
 
 
 def _all_alike(vademecum: Vademecum, _: Elasticity, n: int, *__: object) -> StepErrors:
-    """In place of touches: each 1 % off."""
+    """Return errors of 1 % in place of touches."""
     details = details_of(vademecum.n_modes)
     off = np.full(n, 0.01)
     return StepErrors(np.tile(off, (len(details) - 1, 1)), off, off, [0] * len(details))
 
 
 def _certificate(mesh: TetMesh, scale: float, patch: pytest.MonkeyPatch) -> Certificate:
-    """Of an organ in another size, pressed by a tool in that size."""
+    """Certify an organ in another size, pressed by a tool in that size."""
     for module, name, value in ((tip_field, "SPACING", 2.5e-3), (tip_field, "MARGIN", 30e-3)):
         assert hasattr(module, name)
         patch.setattr(module, name, value * scale)
@@ -331,7 +331,7 @@ def _certificate(mesh: TetMesh, scale: float, patch: pytest.MonkeyPatch) -> Cert
 def test_organs_of_millimetres_and_metres_get_the_same_certificate(
     monkeypatch: pytest.MonkeyPatch, figure: Figure
 ) -> None:
-    """No length but the tool's is written into the offline stage: powers of 4 change no bit."""
+    """The offline stage holds no length except the tool's: powers of 4 change no bit."""
     mesh = box_mesh(4)
     usual, *others = (_certificate(mesh, scale, monkeypatch) for scale in (1.0, 4.0**-3, 4.0**2))
     figure(f"organs of 1.6 mm and 1.6 m: L2 {others[0].l2_mean:.3%}, contact exactly the same too")
@@ -344,7 +344,7 @@ def test_organs_of_millimetres_and_metres_get_the_same_certificate(
 @pytest.mark.long
 @pytest.mark.parametrize("scale", [4.0**-3, 4.0])
 def test_organs_of_millimetres_and_metres_are_meshed(scale: float, figure: Figure) -> None:
-    """A liver of 3 mm and one of 0.8 m, filled as well as one of 0.2 m."""
+    """A liver of 3 mm and one of 0.8 m are filled as well as one of 0.2 m."""
     liver = phantom_liver(12e-3)
     mesh = tetrahedralize(replace(liver, vertices=scale * liver.vertices), 700)
     worst = quality(mesh)

@@ -11,17 +11,17 @@ from avatar_core.fem.half_space_contact import loads_on_heights, ring_radii, sec
 from avatar_core.fem.signorini import half_space_radius
 from avatar_core.geometry.tip import Tip
 
-WINDOW = 1.8  # over the radius of the contact on a plane
+WINDOW = 1.8  # relative to the radius of the contact on a plane
 
 
 def on_heights(radius: float, depth: float, window: float, height: np.ndarray) -> float:
-    """F / E* on a ball over a surface ``height`` below the plane, (RINGS, SECTORS)."""
+    """Return F / E* on a ball over a surface ``height`` below the plane, (RINGS, SECTORS)."""
     under = Tip("sphere", radius).height(window * ring_radii()) - depth
     return float(loads_on_heights(under[None], np.array([window]), height[None])[0])
 
 
 def load(radius: float, depth: float, kappa_x: float = 0.0, kappa_y: float = 0.0) -> float:
-    """F / E* on a ball over a surface that falls off as kappa_x x^2 / 2 + kappa_y y^2 / 2."""
+    """Return F / E* on a ball over a surface that falls as kappa_x x^2 / 2 + kappa_y y^2 / 2."""
     window = min(WINDOW * half_space_radius(Tip("sphere", radius), depth), 0.999 * radius)
     r, theta = window * ring_radii()[:, None], sector_angles()
     height = 0.5 * r**2 * (kappa_x * np.cos(theta) ** 2 + kappa_y * np.sin(theta) ** 2)
@@ -75,7 +75,7 @@ def test_a_ball_on_a_ridge_touches_over_hertzs_ellipse() -> None:
 
 
 def test_the_tilt_of_a_plane_turns_the_force() -> None:
-    """Across a plane tilted by 10 degrees, what is left of the depth is its cosine."""
+    """Across a plane tilted by 10 degrees, the depth shrinks by the cosine."""
     radius, depth, tilt = 5e-3, 1e-3, np.radians(10.0)
     window = 2.2 * half_space_radius(Tip("sphere", radius), depth)
     height = np.tan(tilt) * window * ring_radii()[:, None] * np.cos(sector_angles())

@@ -20,7 +20,7 @@ both = pytest.mark.parametrize("material", MATERIALS, ids=["StVK", "neo-Hookean"
 
 @pytest.fixture
 def gradients() -> np.ndarray:
-    """Deformation gradients far from the identity, det F > 0."""
+    """Draw deformation gradients far from the identity, det F > 0."""
     F = np.eye(3) + 0.4 * np.random.default_rng(3).uniform(-1.0, 1.0, (60, 3, 3))
     return F[np.linalg.det(F) > 0.2]
 

@@ -65,7 +65,7 @@ def test_interpolation_is_exact_at_positions_and_continuous(phantom_mesh: TetMes
 
 
 def _inner_edge(corners: np.ndarray) -> tuple[int, int, tuple[int, int]]:
-    """An edge and the two faces that share it; edges at the rim have only one."""
+    """Return an edge and the two faces that share it; edges at the rim have only one."""
     seen: dict[tuple[int, ...], int] = {}
     for face, triangle in enumerate(corners):
         for edge in ((triangle[k], triangle[k - 1]) for k in range(3)):
@@ -76,7 +76,7 @@ def _inner_edge(corners: np.ndarray) -> tuple[int, int, tuple[int, int]]:
 
 
 def test_fine_surface_needs_no_midpoints(phantom_mesh: TetMesh) -> None:
-    """Where edges are short against the patch, vertices alone carry it, linearly."""
+    """If edges are short against the patch, only vertices carry it, linearly."""
     regions = regions_by_rule(phantom_mesh)
     coarse = load_surface(phantom_mesh, regions)
     fine = load_surface(phantom_mesh, regions, 4.0 * phantom_mesh.mean_surface_edge)
@@ -105,7 +105,7 @@ def test_patch_normals_turn_smoothly_over_an_edge() -> None:
 
 @pytest.mark.long
 def test_walls_of_a_narrow_fissure_carry_no_load() -> None:
-    """A slot 5 mm wide in a box: a patch of 30 mm has no room on its walls, and has beside it."""
+    """A slot 5 mm wide in a box: a patch of 30 mm has no room on its walls, but beside it."""
     mesh = box_mesh(20)
     center = mesh.vertices[mesh.tets].mean(axis=1)
     slot = (abs(center[:, 0] - 0.0525) < 2.5e-3) & (center[:, 1] > 0.02)
@@ -125,7 +125,7 @@ def test_walls_of_a_narrow_fissure_carry_no_load() -> None:
 
 @pytest.mark.parametrize("radius", [1e-12, 1e-6, 0.0, -1.0, np.nan, np.inf])
 def test_a_patch_that_no_mesh_resolves_is_refused(radius: float, figure: Figure) -> None:
-    """At every door, and at once: integrating it would take as many points as the ratio squared."""
+    """All loaders refuse it at once: integrating it would need the squared ratio of points."""
     problem = clamped_cube(2)
     mesh = problem.mesh
     with pytest.raises(MeshError, match=r"cannot be resolved.*refine the mesh") as refused:
@@ -139,7 +139,7 @@ def test_a_patch_that_no_mesh_resolves_is_refused(radius: float, figure: Figure)
 
 @pytest.mark.examples
 def test_a_patch_larger_than_the_organ_is_refused(figure: Figure) -> None:
-    """Its pull would be no direction's; one that the organ can hold pulls with all its force."""
+    """A pull of it has no direction; the largest patch that fits pulls with all its force."""
     held = [0.0]
 
     @examples(30)
@@ -170,7 +170,7 @@ def test_a_patch_larger_than_the_organ_is_refused(figure: Figure) -> None:
 
 @pytest.mark.parametrize("thickness", [2e-3, 30e-3])
 def test_a_patch_around_a_leaf_is_refused(thickness: float, figure: Figure) -> None:
-    """Much thinner than the patch, its two sides cancel; as thick as that, a side has a normal."""
+    """If much thinner than the patch, its two sides cancel; if as thick, a side has a normal."""
     line = np.linspace(0.0, 0.1, 6)
     leaf = block(line, np.linspace(0.0, thickness, 2), line)
     if thickness > 0.02:

@@ -34,16 +34,16 @@ from tests.helpers.soft_box import (
 
 Figure = Callable[[str], None]
 
-CORK = Material(YOUNG, 0.0)  # a column of it does not swell: stretched alone, it is a closed form
+CORK = Material(YOUNG, 0.0)  # a column of it does not swell: uniaxial stretch has a closed form
 CRITICAL = 1.0 / np.sqrt(3.0)  # stretch at which d/ds (s^3 - s) = 0
-ROUNDING = 1e-9  # of a displacement that the elements hold exactly, over the length
+ROUNDING = 1e-9  # of a displacement that the elements hold exactly, relative to the length
 
 MATERIALS = {"StVK": StVenantKirchhoff, "neo-Hookean": NeoHookean}
 both = pytest.mark.parametrize("kind", MATERIALS.values(), ids=list(MATERIALS))
 
 
 def column(problem: Hyperelasticity) -> tuple[np.ndarray, np.ndarray]:
-    """Loads and motion that shorten a column by one, plane section by plane section."""
+    """Return loads and motion that shorten a column by one, plane section by plane section."""
     y = nodes_of(problem)[:, 1]
     top, inside = np.flatnonzero(y > 0.999 * LENGTH), np.flatnonzero(y > 1e-9)
     dofs = np.concatenate([3 * top + 1, 3 * inside, 3 * inside + 2])
@@ -51,13 +51,13 @@ def column(problem: Hyperelasticity) -> tuple[np.ndarray, np.ndarray]:
 
 
 def column_force(kind: type, s: float) -> float:
-    """Push on the column at a stretch; Poisson's ratio zero: E = 2 mu, lambda = 0 [N]."""
+    """Return the push on the column at a stretch; nu = 0: E = 2 mu, lambda = 0 [N]."""
     curve = (s - s**3) if kind is StVenantKirchhoff else (1.0 / s - s)
     return YOUNG / 2.0 * curve * LENGTH**2
 
 
 def even_pressure(problem: Hyperelasticity) -> np.ndarray:
-    """A dead load of 1 N down on the top face, evenly spread, shape (3 n_nodes,)."""
+    """Return a dead load of 1 N down on the top face, evenly spread, shape (3 n_nodes,)."""
     forces = problem.forces(stretched(problem, 1.01)).reshape(-1, 3)
     down = np.zeros_like(forces)
     top = nodes_of(problem)[:, 1] > 0.999 * LENGTH
@@ -66,7 +66,7 @@ def even_pressure(problem: Hyperelasticity) -> np.ndarray:
 
 
 def push_on(problem: Hyperelasticity) -> np.ndarray:
-    """A unit patch load down on the middle of the top face."""
+    """Return a unit patch load down on the middle of the top face."""
     unit = patch_loads(problem.linear, np.array([[0.05, LENGTH, 0.05]]), 0.04)
     return np.asarray(unit @ [0.0, -1.0, 0.0]).ravel()
 
@@ -84,7 +84,8 @@ def test_newton_finds_a_large_strain_quadratically(kind: type) -> None:
     state = solve(problem, load, NewtonRule(tolerance=1e-12))
     assert np.linalg.norm(state.displacement - exact) < 1e-9 * np.linalg.norm(exact)
     r = state.residuals
-    near = (r[:-1] < 0.1) & (r[1:] > 1e-10)  # before it is far away, after it rounding rules
+    # far away convergence is slower, near the solution rounding dominates
+    near = (r[:-1] < 0.1) & (r[1:] > 1e-10)
     assert near.sum() >= 1
     assert (r[1:] < 10.0 * r[:-1] ** 2)[near].all()
 
@@ -102,7 +103,7 @@ def test_small_load_moves_as_in_linear_elasticity(kind: type) -> None:
 
 
 def test_unstable_states_are_refused() -> None:
-    """By the pivots where a state is returned, by the conjugate gradients on the way to one."""
+    """Pivots show it where a state is returned, conjugate gradients on the way there."""
     mesh = box_mesh(2)
     problem = Hyperelasticity(mesh, StVenantKirchhoff(SOFT), np.ones_like(mesh.face_areas, bool))
     crushed = stretched(problem, 0.5)
@@ -181,10 +182,10 @@ def test_42_percent_compression(kind: type, figure: Figure) -> None:
 
 @pytest.mark.parametrize("share", [0.6, 0.99])
 def test_dead_load_is_refused_where_it_is_lost_and_not_later(share: float, figure: Figure) -> None:
-    """What is said to be carried is carried, what is said to be lost is lost."""
+    """Equilibrium exists below the reported load, and none above it."""
     problem = box(StVenantKirchhoff(CORK), 2)
     pressure = even_pressure(problem)
-    # the most that s - s^3 gives; a free column buckles before
+    # the maximum of s - s^3; a free column buckles before
     load = share * YOUNG * LENGTH**2 / (3.0 * np.sqrt(3.0)) * pressure
     with pytest.raises(EquilibriumError) as refused:
         solve(problem, load)
@@ -239,7 +240,7 @@ def test_no_accepted_step_holds_an_inverted_element(kind: type) -> None:
 
 
 def lobe() -> tuple[TetMesh, np.ndarray]:
-    """A rounded slab of 140 x 100 x 120 mm, always the same, and its clamped underside."""
+    """Return a rounded slab of 140 x 100 x 120 mm, always the same, and its clamped underside."""
     cube = box_mesh(4, (2.0, 2.0, 2.0))
     corner = cube.vertices - 1.0
     x, y, z = corner.T**2
@@ -261,7 +262,7 @@ def lobe() -> tuple[TetMesh, np.ndarray]:
     ],
 )
 def test_60_mm(name: str, way: str, spacing: float, bearable: float, figure: Figure) -> None:
-    """All the way or refused with the depth reached; until there, what was done is stored.
+    """It reaches 60 mm, or is refused with the depth reached; until there, work is stored.
 
     bearable : depth at which the organ has an equilibrium, so that refusing it is wrong [m]
     """
@@ -301,10 +302,11 @@ def test_60_mm(name: str, way: str, spacing: float, bearable: float, figure: Fig
 
 @both
 def test_push_release_pull_release(kind: type, figure: Figure) -> None:
-    """Nothing is left behind, and every state is the one that is reached from rest."""
+    """No history is left, and every state equals the one reached from rest."""
     problem = box(kind(SOFT))
     patch = patch_loads(problem.linear, np.array([[0.05, LENGTH, 0.05]]), 0.04).toarray()
-    depth, remainder = 6e-3, 1e-6  # residuals are over the force: it must not vanish altogether
+    # residuals are relative to the force: it must not vanish altogether
+    depth, remainder = 6e-3, 1e-6
     path = depth * np.array([1.0, remainder, -1.0, -remainder, 1.0])
     inward = np.array([0.0, -1.0, 0.0])
     motions = [step * inward for step in np.diff([0.0, *path])]

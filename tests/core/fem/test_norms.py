@@ -35,7 +35,7 @@ def test_relative_errors_are_those_of_each_column(shape: tuple[int, ...]) -> Non
 
 @pytest.mark.parametrize(("row", "column"), [(0, 0), (5, 3), (2, 1)])
 def test_one_wrong_entry_of_the_gram_matrix_is_noticed(row: int, column: int) -> None:
-    """With the last four of six functions new: on the diagonal, among them, and to an old one."""
+    """The last four of six functions are new: the entry is on the diagonal, or off it twice."""
     functions = np.linalg.qr(np.random.default_rng(1).standard_normal((40, 6)))[0]
     images = functions[:, 2:]
     require_orthonormal(functions, images, "functions")

@@ -1,4 +1,4 @@
-"""The vademecum's patch on a half-space: what it dents, and what it does to another patch."""
+"""The vademecum's patch on a half-space: its own dent, and its effect on another patch."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from tests.helpers.contact import prepare, step
 
 
 def patch_rule(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Radii [R_p] and parts of the patch's own load, 3 / pi (1 - r^2)^2."""
+    """Return radii [R_p] and parts of the patch's own load, 3 / pi (1 - r^2)^2."""
     node, weight = np.polynomial.legendre.leggauss(n)
     r = 0.5 * (node + 1.0)
     return r, 0.5 * weight * 6.0 * r * (1.0 - r * r) ** 2
 
 
 def ring_dent(rho: float) -> float:
-    """E* R_p / F u of the patch by Boussinesq: its pressure as rings, each an elliptic integral."""
+    """Return E* R_p / F u of the patch by Boussinesq: pressure rings as elliptic integrals."""
 
     def ring(s: float) -> float:
         whole = (rho + s) ** 2
@@ -47,7 +47,7 @@ def test_the_patch_dents_as_boussinesq_says() -> None:
 
 
 def mean_under_another(y: float) -> float:
-    """The mean of a patch's dent under the pressure of a patch at the distance y."""
+    """Return the mean of a patch's dent under the pressure of a patch at the distance y."""
     r, load = patch_rule(60)
     angle = (np.arange(120) + 0.5) * np.pi / 120
     apart = np.sqrt(y * y + r[:, None] ** 2 + 2.0 * y * r[:, None] * np.cos(angle))
@@ -90,7 +90,7 @@ def test_what_is_shared_has_no_step_where_its_table_ends() -> None:
 
 
 def test_a_cubes_top_is_as_soft_between_load_positions_as_at_them() -> None:
-    """What sum_ij w_i w_j C_ij lacks there, 2 to 4 %, is known on a half-space."""
+    """The 2 to 4 % that sum_ij w_i w_j C_ij lacks there are known on a half-space."""
     v = organ("cube")
     data = prepare(v, (Tip("patch", 8e-3),), cloud="off", effects=())
     rng, state, felt, blurred = np.random.default_rng(0), data.state, [], []

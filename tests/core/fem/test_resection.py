@@ -23,7 +23,7 @@ LEVEL = CutSurface((1.0, 0.0, 0.0), (0.05, 0.05, 0.05), (0.0, 1.0, 0.0))
 
 
 def at(mesh: TetMesh, axis: int, place: float) -> np.ndarray:
-    """Faces in a plane across an axis, shape (n_faces,)."""
+    """Select faces in a plane across an axis, shape (n_faces,)."""
     off = np.abs(mesh.vertices[mesh.boundary_faces][:, :, axis] - place)
     return np.asarray((off < 1e-9).all(axis=1))
 
@@ -36,7 +36,7 @@ def cut_box(
     mesh: TetMesh | None = None,
     clamp: tuple[int, ...] = (1,),
 ) -> Elasticity:
-    """A box, clamped where each of some coordinates is 0."""
+    """Return a box, clamped where each of some coordinates is 0."""
     mesh = cut(*snapped(mesh or box_mesh(4), surface))
     clamped = np.any([at(mesh, axis, 0.0) for axis in clamp], axis=0)
     resection = replace(Resection.of(mesh, surface, 1e5), opened=opened)
@@ -107,7 +107,8 @@ def test_strips_share_the_area_that_opens_and_take_no_energy_from_rigid_motions(
     part: float,
 ) -> None:
     mesh = cut(*snapped(box_mesh(4), LEFT_RIGHT))
-    askew = replace(LEFT_RIGHT, open_along=(0.0, -1.0, 0.37), part=part)  # to no line of the mesh
+    # parallel to no line of the mesh
+    askew = replace(LEFT_RIGHT, open_along=(0.0, -1.0, 0.37), part=part)
     resection = Resection.of(mesh, askew, 1e5)
     problem = Elasticity(mesh, Material(), at(mesh, 1, 0.0), resection=resection)
     moved = np.zeros((problem.n_nodes, 3))
@@ -171,7 +172,7 @@ def test_compliance_is_symmetric_and_loads_reach_both_sides() -> None:
     assert np.linalg.eigvalsh(answer).min() > 0.0
 
 
-# --- what holds the parts -------------------------------------------------------------------------
+# --- supports of the parts ------------------------------------------------------------------------
 
 
 def test_a_part_that_nothing_holds_is_refused_by_its_side_and_volume() -> None:
@@ -181,7 +182,7 @@ def test_a_part_that_nothing_holds_is_refused_by_its_side_and_volume() -> None:
         cut_box(LEVEL, 1.0).solve(np.zeros((3, 1)))
     assert "500 ml, 50%, on the normal's side" in str(said.value)
     assert "\n" not in str(said.value)
-    cut_box(LEVEL, 0.8).factorize()  # what stays tied holds it
+    cut_box(LEVEL, 0.8).factorize()  # the remaining ties hold it
 
 
 def test_supports_hold_a_part_and_what_stays_tied_does_too() -> None:

@@ -1,4 +1,4 @@
-"""Resolved contact: Sneddon's exact tips, the conditions of contact, and what is refused."""
+"""Resolved contact: Sneddon's exact tips, the conditions of contact, and refusals."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from avatar_core.geometry.tip import Tip
 from avatar_core.offline.resolved_contact import contacts_at
 from tests.core.conftest import box_mesh, box_regions
 
-SIDE = 0.2  # of the cube that stands for a half-space [m]
+SIDE = 0.2  # of the cube in place of a half-space [m]
 TOP = np.array([0.5 * SIDE, SIDE, 0.5 * SIDE])
 UP = np.array([0.0, 1.0, 0.0])
 MATERIAL = Material()
@@ -44,7 +44,7 @@ def _sphere_force(radius: float, depth: float) -> float:
 
 @pytest.fixture(scope="module")
 def pressed() -> CondensedContact:
-    """A sphere, a punch and a cone over the same place of a cube, some six elements across."""
+    """Press a sphere, a punch and a cone at one place of a cube, about six elements across."""
     pushes = [Push(tip, TOP, UP) for tip in (SPHERE, PUNCH, CONE)]
     return CondensedContact(_cube(0.7e-3, 0.25, 0.7), pushes, np.array([2e-3, 1e-3, 1e-3]))
 
@@ -80,7 +80,7 @@ def test_the_surface_gives_way_and_pushes_back(pressed: CondensedContact) -> Non
 
 @pytest.mark.long
 def test_a_ball_pushed_askew_finds_the_axis_without_moment() -> None:
-    """In a half-space that is its normal, and the force Sneddon's, whatever axis it began with."""
+    """In a half-space it is the normal, with Sneddon's force, whatever the first axis."""
     depth, angle = 1e-3, np.radians(12.0)
     axis = np.array([np.sin(angle), np.cos(angle), 0.0])
     to_centre = SPHERE.radius - depth
@@ -113,7 +113,7 @@ def test_contacts_at_a_place_turn_the_axis_of_balls_alone() -> None:
 
 
 def across(axis: np.ndarray) -> np.ndarray:
-    """The direction across an axis in which ``UP`` leans away from it."""
+    """Return the direction across an axis in which ``UP`` leans away from it."""
     side = (axis @ UP) * axis - UP
     return np.asarray(side / np.linalg.norm(side))
 

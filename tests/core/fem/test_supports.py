@@ -1,4 +1,4 @@
-"""What holds an organ: clamps and springs, against closed forms and rigid bodies."""
+"""Supports of an organ: clamps and springs, against closed forms and rigid bodies."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ELEMENTS: tuple[Element, ...] = ("P1", "P2", "Taylor-Hood")
 
 
 def bottom(mesh: TetMesh) -> np.ndarray:
-    """Faces at y = 0, shape (n_faces,)."""
+    """Select the faces at y = 0, shape (n_faces,)."""
     return np.asarray((mesh.vertices[mesh.boundary_faces][:, :, 1] < 1e-9).all(axis=1))
 
 
@@ -39,7 +39,7 @@ def on_springs(
 
 
 def push_on_top(problem: Elasticity, direction: tuple[float, float, float]) -> np.ndarray:
-    """Nodal forces of 1 N spread evenly over y = SIDE, shape (3 n_nodes, 1)."""
+    """Return nodal forces of 1 N spread evenly over y = SIDE, shape (3 n_nodes, 1)."""
     height = problem.mesh.vertices[problem.mesh.boundary_faces][:, :, 1]
     top = np.flatnonzero((height > SIDE - 1e-9).all(axis=1))
     return force_on(problem, top, np.array(direction) / SIDE**2)
@@ -116,7 +116,7 @@ def test_stiff_springs_are_the_clamp(element: Element) -> None:
         return float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
 
     assert miss(1e12) < 1e-5
-    # once springs are stiffer than the organ, what they give way falls as 1 / k
+    # once springs are stiffer than the organ, their displacement falls as 1 / k
     assert miss(1e10) == pytest.approx(10.0 * miss(1e11), rel=0.05)
     assert miss(1e6) > 0.05
 
@@ -170,7 +170,7 @@ def test_a_refined_mesh_keeps_its_supports() -> None:
     assert after == pytest.approx(before, rel=0.02)
 
 
-# --- what holds an organ --------------------------------------------------------------------------
+# --- held organs ----------------------------------------------------------------------------------
 
 
 def test_an_organ_that_nothing_holds_is_refused_by_its_free_motion() -> None:
@@ -186,7 +186,7 @@ def test_springs_on_a_narrow_strip_leave_the_rotation_about_it() -> None:
     mesh = box_mesh(6, (0.1, 0.02, 0.1))
     centre = mesh.vertices[mesh.boundary_faces].mean(axis=1)
     strip = bottom(mesh) & (np.abs(centre[:, 0] - 0.05) < 0.01)
-    # along z the strip is as long as the box: it is the turn about z that is all but free
+    # along z the strip is as long as the box: only the turn about z is nearly free
     nobody = np.zeros(len(mesh.boundary_faces), bool)
     problem = Elasticity(mesh, Material(1e9), nobody, supports=(Support("strip", strip, 1.0),))
     with pytest.raises(MaterialError, match=r"rotation about \(0.0, 0.0, 1.0\)"):
@@ -203,7 +203,7 @@ def test_no_motion_of_the_boundary_costs_less_than_the_least_resisted_one() -> N
     square = problem.mesh.face_areas @ (points**2).sum(axis=2).mean(axis=1)
     work = float(force.ravel() @ found.ravel())
     assert least.resistance * square < work
-    # and a load that drives that motion, a couple about an axis of the springs' plane, comes close
+    # a load that drives that motion, a couple about an axis of the springs' plane, comes close
     y, x = nodes_of(problem)[:, 1] - SIDE / 2.0, nodes_of(problem)[:, 0] - SIDE / 2.0
     couple = np.stack([-y, x, np.zeros_like(x)], axis=1).reshape(-1, 1)
     turned = problem.solve(couple)
@@ -252,7 +252,7 @@ TOUCHING = {"apart": [0.5, 0.0, 0.0], "by an edge": [0.1, 0.0, 0.1], "by a verte
 
 
 def two_cubes(offset: list[float]) -> TetMesh:
-    """Two cubes, with the vertices where they touch in common."""
+    """Return two cubes that share the vertices where they touch."""
     one = box_mesh(2)
     points = np.vstack([one.vertices, one.vertices + offset])
     vertices, number = np.unique(points.round(9), axis=0, return_inverse=True)
@@ -265,7 +265,7 @@ def two_cubes(offset: list[float]) -> TetMesh:
 def test_a_piece_without_a_clamp_is_refused(
     touching: str, element: Element, figure: Figure
 ) -> None:
-    """Also under a load on the clamped piece alone, whose balance tells nothing."""
+    """Also under a load on the clamped piece alone, whose balance shows nothing."""
     mesh = two_cubes(TOUCHING[touching])
     corners = mesh.vertices[mesh.boundary_faces]
     only_first = (corners[..., 1] < 1e-9).all(axis=1) & (corners[..., 0] < 0.1001).all(axis=1)
@@ -283,7 +283,7 @@ def test_a_piece_without_a_clamp_is_refused(
 @pytest.mark.parametrize("element", ["P2", "Taylor-Hood"])
 @pytest.mark.parametrize("springs", [False, True])
 def test_two_held_pieces_answer_each_for_itself(element: Element, springs: bool) -> None:
-    """The second by a clamp, or by springs so stiff that they are one."""
+    """The second is held by a clamp, or by springs as stiff as one."""
     mesh = two_cubes(TOUCHING["apart"])
     alone = compliance(clamped_cube(2, element=element))
     first = mesh.vertices[mesh.boundary_faces][:, :, 0].max(axis=1) < 0.5

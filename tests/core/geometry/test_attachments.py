@@ -1,4 +1,4 @@
-"""Where supports lie: by rule on a liver, by groups of points, and what is left to a tool."""
+"""Position of supports: by rule on a liver, by groups of points, and the rest for tools."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def places(phantom_mesh: TetMesh) -> dict[str, np.ndarray]:
 
 
 def centre(mesh: TetMesh, faces: np.ndarray) -> np.ndarray:
-    """Centroid of some faces [m]."""
+    """Return the centroid of some faces [m]."""
     middle = mesh.vertices[mesh.boundary_faces[faces]].mean(axis=1)
     return np.asarray(np.average(middle, axis=0, weights=mesh.face_areas[faces]))
 
@@ -156,7 +156,7 @@ def test_a_support_that_is_nowhere_is_refused(phantom_mesh: TetMesh) -> None:
         held_by(phantom_mesh, [SupportOption.parse("dome=1e5")])
 
 
-# --- as asked for on the command line ------------------------------------------------------------
+# --- options of the command line ------------------------------------------------------------------
 
 
 def test_a_support_is_fixed_free_to_choose_or_clamped() -> None:

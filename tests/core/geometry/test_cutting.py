@@ -27,7 +27,7 @@ def plane_at(x: float, normal: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> 
 
 
 def bezier(height: np.ndarray) -> CutSurface:
-    """Control points over a square of 0.1 m in y and z, at x = 0.05 + height (4, 4)."""
+    """Return control points over a square of 0.1 m in y and z, at x = 0.05 + height (4, 4)."""
     along = np.linspace(0.0, 0.1, 4)
     y, z = np.meshgrid(along, along, indexing="ij")
     points = np.stack([0.05 + height, y, z], axis=2).reshape(16, 3)
@@ -61,7 +61,7 @@ def test_vertices_move_onto_a_plane_between_them(
 ) -> None:
     surface = plane_at(x, normal)
     mesh, second = snapped(box_mesh(6), surface)
-    assert mesh.volume == pytest.approx(1e-3, rel=1e-4)  # its edges alone have no tangent plane
+    assert mesh.volume == pytest.approx(1e-3, rel=1e-4)  # only its edges have no tangent plane
     assert quality(mesh).min_dihedral > 5.0
     faces = cut(mesh, second).cut_faces[0]
     off = np.abs(surface.heights(mesh.vertices[np.unique(faces)]))

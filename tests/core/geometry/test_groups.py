@@ -1,4 +1,4 @@
-"""Groups of points give the area that they cover, whatever the mesh on which they are found."""
+"""Groups of points give the area that they cover, whatever the mesh."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from avatar_core.geometry.phantom import phantom_liver
 def test_nodes_of_another_mesh_give_their_own_area(
     phantom_mesh: TetMesh, radius: float, number: int
 ) -> None:
-    """The faces within a ball of a mesh of other size: with a mesh's edge around, twice as much."""
+    """The faces within a ball on another mesh; one more edge around would double the area."""
     fine = tetrahedralize(phantom_liver(), 2500)
     centre = fine.vertices[fine.surface_vertices[number]]
     inside = np.linalg.norm(fine.vertices - centre, axis=1) < radius

@@ -1,4 +1,4 @@
-"""Label maps: where their voxels lie, which label is meant, and what is refused."""
+"""Label maps: position of voxels, choice of the label, and refusals."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from avatar_core.geometry.surface import read_surface
 from avatar_core.geometry.tumour import read_tumour
 from tests.helpers.known_surfaces import refused
 
-WHOLE = 4 / 3 * np.pi * 0.04 * 0.05 * 0.06  # of the ellipsoid [m^3]
+WHOLE = 4 / 3 * np.pi * 0.04 * 0.05 * 0.06  # volume of the ellipsoid [m^3]
 
 
 def label_map(path: Path, affine: np.ndarray, labels: tuple[int, ...] = (1,)) -> Path:
-    """An ellipsoid of 40, 50, 60 mm about (10, -20, 30) mm in world coordinates."""
+    """Write an ellipsoid of 40, 50, 60 mm about (10, -20, 30) mm in world coordinates."""
     shape = tuple(np.ceil(160 / np.linalg.norm(affine[:3, :3], axis=0)).astype(int))
     voxels = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
     world = voxels @ affine[:3, :3].T + affine[:3, 3]
@@ -51,7 +51,7 @@ def test_label_map_honours_its_affine(tmp_path, turn, mirror, size):
     assert np.allclose(high, [0.05, 0.03, 0.09], atol=size[2] * 0.5e-3)
     assert surface.volume == pytest.approx(WHOLE, rel=0.02)
     (notice,) = surface.notices
-    assert notice in [f"read label 1, {n} ml" for n in (501, 502, 503)]  # of 502.7, by voxels
+    assert notice in [f"read label 1, {n} ml" for n in (501, 502, 503)]  # of 502.7 ml, by voxels
 
 
 @pytest.mark.parametrize("radius", [5.0, 10.0])
@@ -78,7 +78,7 @@ def test_label_map_asks_which_label(tmp_path):
 
 
 def segmentation(path: Path, names: dict[str, int], layers: int = 1, **header: Any) -> Path:
-    """A file as 3D Slicer writes it: a liver about (10, -20, 30) mm in RAS, and a lesion."""
+    """Write a file as 3D Slicer does: a liver about (10, -20, 30) mm in RAS, and a lesion."""
     size = np.array([2.0, 2.5, 3.0])
     turn = Rotation.from_euler("zx", [20.0, -35.0], degrees=True).as_matrix()
     shape = np.ceil(170 / size).astype(int)
@@ -200,10 +200,10 @@ def test_label_map_is_bounded_before_it_is_loaded(tmp_path, monkeypatch):
 
 
 def dicom_segmentation(path: Path, tilt: float = 20.0, kind: str = "BINARY") -> Path:
-    """A liver and a lesion as highdicom writes them, on oblique CT slices of 2 x 2 x 5 mm.
+    """Write a liver and a lesion as highdicom does, on oblique CT slices of 2 x 2 x 5 mm.
 
-    A FRACTIONAL one falls from the whole of it in the middle of an organ to a half at its surface,
-    and on to zero.
+    A FRACTIONAL segment falls from one in the middle of an organ to a half at its surface, and on
+    to zero.
     """
     pytest.importorskip("highdicom", reason="highdicom is missing: '.[dicom]'")
     from highdicom.seg import Segmentation, SegmentDescription
@@ -295,7 +295,7 @@ def test_a_fractional_segmentation_ends_at_half_of_its_largest_value(tmp_path):
 
 
 def test_voxels_of_a_labelmap_are_numbers_of_its_segments(tmp_path):
-    """Whether it describes its background or not: highdicom does, others do so twice."""
+    """It may describe its background: highdicom does not, others do so twice."""
     path = dicom_segmentation(tmp_path / "organs.dcm", kind="LABELMAP")
     lesion = read_tumour(path, label="lesion").volume
     assert lesion == pytest.approx(4 / 3 * np.pi * 0.025 * 0.020 * 0.022, rel=0.05)
@@ -337,13 +337,13 @@ def test_numbers_of_a_map_without_names_are_offered_and_an_image_has_none(tmp_pa
         labels_of(tmp_path / "ct.nii")
 
 
-# --- What headers say, and what they leave open -----------------------------------------------
+# --- Statements and omissions of headers --------------------------------------------------------
 
 PLACE = np.array([[4.0, 0, 0, -70], [0, 4, 0, -100], [0, 0, 4, -50], [0, 0, 0, 1]])  # [mm]
 
 
 def nifti(path: Path, values: Any = None, scale: float = 1.0, unit: int = 0, **forms: Any) -> Path:
-    """The ellipsoid on voxels of 4 mm, or given voxels; forms : of NIfTI, matrix and code."""
+    """Write the ellipsoid on voxels of 4 mm, or given voxels; forms: NIfTI matrix and code."""
     values = ellipsoid() if values is None else values
     image = nibabel.Nifti1Image(values, np.diag([scale, scale, scale, 1.0]) @ PLACE)
     for name, (matrix, code) in forms.items():
@@ -354,14 +354,14 @@ def nifti(path: Path, values: Any = None, scale: float = 1.0, unit: int = 0, **f
 
 
 def ellipsoid() -> np.ndarray:
-    """Voxels of the ellipsoid, 40 each way."""
+    """Return voxels of the ellipsoid, 40 each way."""
     voxels = np.stack(np.meshgrid(*[np.arange(40)] * 3, indexing="ij"), axis=-1)
     world = voxels @ PLACE[:3, :3].T + PLACE[:3, 3]
     return (np.linalg.norm((world - [10, -20, 30]) / [40, 50, 60], axis=-1) < 1).astype(np.uint8)
 
 
 def raw_nrrd(path: Path, *lines: str, content: bytes | None = None, **fields: str) -> Path:
-    """The ellipsoid with a header of further lines and other fields; an empty field is left out."""
+    """Write the ellipsoid with a header of further lines and fields; empty fields are left out."""
     head = {
         "type": "uchar",
         "dimension": "3",
@@ -378,7 +378,7 @@ def raw_nrrd(path: Path, *lines: str, content: bytes | None = None, **fields: st
 
 
 def assert_in_place(path: Path, *notices: str) -> None:
-    """The file holds the ellipsoid where it is, and its first notices say that."""
+    """Check that the file holds the ellipsoid in place, and that its first notices say so."""
     surface = read_surface(path)
     assert surface.volume == pytest.approx(WHOLE, rel=0.03)
     np.testing.assert_allclose(surface.vertices.mean(axis=0), [0.01, -0.02, 0.03], atol=2e-3)

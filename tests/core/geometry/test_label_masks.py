@@ -18,13 +18,13 @@ RADIUS = 60.0  # of the organ, about the middle of the map [mm]
 
 
 def ball(radius: float, *centre: float) -> np.ndarray:
-    """Voxels of a ball about a place [mm] from the middle of the map."""
+    """Return voxels of a ball about a place [mm] from the middle of the map."""
     place = SIZE * (np.stack(np.meshgrid(*[np.arange(N)] * 3, indexing="ij"), -1) - (N - 1) / 2)
     return np.linalg.norm(place - centre, axis=-1) < radius
 
 
 def written(path: Path, *bodies: np.ndarray, cut: Any = ()) -> Path:
-    """Bodies with labels from 1 on, each in place of those before; cut : what is left of the map"""
+    """Write bodies with labels from 1 on, each over those before; cut : part of the map to keep."""
     values = np.zeros((N, N, N), np.uint8)
     for label, body in enumerate(bodies, 1):
         values[body] = label

@@ -1,4 +1,4 @@
-"""Signed distance on grids, isosurface, volume and overlap, against shapes that are known."""
+"""Signed distance on grids, isosurface, volume and overlap, against known shapes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from tests.helpers.known_surfaces import (
 
 # figures are only added to
 few = examples(5, suppress_health_check=[HealthCheck.function_scoped_fixture])
-fractions = st.tuples(*3 * [st.floats(0, 1)])  # of a cell: where the grid lies
+fractions = st.tuples(*3 * [st.floats(0, 1)])  # of a cell: position of the grid
 
 
 def sphere_grid(spacing: float) -> DistanceGrid:
@@ -54,7 +54,7 @@ def sphere_grid(spacing: float) -> DistanceGrid:
 
 
 def box_around(surface: SurfaceMesh, spacing: float, shift: tuple[float, float, float]) -> GridBox:
-    """A box with room of two to three cells, displaced by fractions of a cell."""
+    """Return a box with a margin of two to three cells, shifted by fractions of a cell."""
     low, high = surface.bounding_box
     x, y, z = low - spacing * (2 + np.array(shift))
     nx, ny, nz = (int(n) for n in np.ceil((high - low) / spacing) + 6)
@@ -186,11 +186,11 @@ def test_too_narrow_a_band_raises(phantom):
         distance_grid(phantom, 5e-3, 10e-3, band=9e-3)
 
 
-# --- overlap and distance of other fields -------------------------------------------------------
+# --- overlap, and distance of other fields --------------------------------------------------------
 
 
 def grid_gradient(grid: DistanceGrid) -> np.ndarray:
-    """|grad phi| by central differences at the points within 1.5 spacings of the surface."""
+    """Return |grad phi| by central differences, within 1.5 spacings of the surface."""
     slopes = np.stack(np.gradient(grid.values, grid.spacing), axis=-1)
     near = np.abs(grid.values) < 1.5 * grid.spacing
     near[[0, -1]] = near[:, [0, -1]] = near[:, :, [0, -1]] = False
@@ -335,7 +335,7 @@ def test_a_grid_beside_the_organ_is_refused():
 
 
 def liver_level_set(path: Path) -> tuple[float, float, float]:
-    """Volume error, share of nodes near the surface where |grad phi| = 1, steepest change."""
+    """Return volume error, part of near nodes with |grad phi| = 1, and steepest change."""
     spacing = 2.5e-3
     surface = read_surface(path)
     grid = distance_grid(surface, spacing, 4 * spacing, band=4 * spacing)
@@ -352,7 +352,7 @@ FOUR = ("Amos-007", "LiTS-27", "LiTS-52", "LiTS-74")  # two closed, two with sli
 
 @pytest.mark.long
 def test_level_sets_of_real_livers(figure, livers_dir):
-    """Of every eighth, and of the four."""
+    """Every eighth liver, and the four."""
     paths = sorted(livers_dir.glob("*.obj"))
     paths = [path for i, path in enumerate(paths) if i % 8 == 0 or path.stem in FOUR]
     assert len(paths) >= 8 and {path.stem for path in paths} >= {*FOUR}

@@ -1,4 +1,4 @@
-"""Tetrahedra: an organ is filled, and wholly."""
+"""Tetrahedra fill the whole organ."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_mesh_that_lacks_a_part_of_the_organ_is_refused() -> None:
 
 
 def test_the_same_surface_gives_the_same_mesh() -> None:
-    """Left to itself, fTetWild inserts the faces in another order each time."""
+    """Without a seed, fTetWild inserts the faces in another order each time."""
     liver = phantom_liver(12e-3)
     one, other = (unwrap(mesh._fill)(liver, 0.03) for _ in range(2))
     np.testing.assert_array_equal(one.tets, other.tets)
@@ -59,7 +59,7 @@ def test_the_same_surface_gives_the_same_mesh() -> None:
 
 
 def test_a_system_where_the_seed_stays_random_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As where the compiled module is no ELF file: the mesh is made, and said to be of chance."""
+    """If the compiled module is no ELF file, the mesh is made, with a notice that it is random."""
     monkeypatch.setattr(tetwild, "_PROCESS", tetwild._PROCESS.replace("ELF", "EXE"))
     with pytest.warns(RuntimeWarning, match="two meshes of one surface differ"):
         _filled()
@@ -95,7 +95,7 @@ def test_neither_pyvista_nor_vtk_is_imported(tmp_path: Path) -> None:
 
 @pytest.fixture
 def anew() -> Iterator[None]:
-    """The compiled module is looked for again, before and after."""
+    """Find the compiled module again, before and after."""
     tetwild._compiled.cache_clear()
     yield
     tetwild._compiled.cache_clear()

@@ -1,4 +1,4 @@
-"""Interpolated offsets from a surface, against those found point by point."""
+"""Interpolated offsets from a surface, against offsets computed point by point."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How an organ lies: candidate rotations, and surfaces that are turned against the phantom."""
+"""Orientation of an organ: candidate rotations, and turned surfaces against the phantom."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ def test_orientation_ignores_place_and_size(phantom):
 
 
 TURNED = {f"LiTS-{n}" for n in (6, 7, 8, 9, 10)}
-UPRIGHT = "Amos-007"  # of another source
+UPRIGHT = "Amos-007"  # from another source
 
 
 def turns(files, phantom):
-    """Gain of every file, and the names of those that count as turned."""
+    """Return the gain of every file, and the names of those that count as turned."""
     offsets = {path.stem: orientation_offset(read_surface(path), phantom) for path in files}
     gains = {name: offset.gain for name, offset in offsets.items()}
     return gains, {name for name, offset in offsets.items() if offset.is_turned}
 
 
 def test_turned_livers_warn_and_upright_ones_do_not(livers_dir, phantom):
-    """One of each kind; the long test below asks more."""
+    """One liver of each kind; the long test below covers more."""
     some = sorted(TURNED)[0]
     files = [livers_dir / f"{name}.obj" for name in (some, UPRIGHT)]
     assert turns(files, phantom)[1] == {some}
@@ -69,7 +69,7 @@ def test_turned_livers_warn_and_upright_ones_do_not(livers_dir, phantom):
 
 @pytest.mark.long
 def test_only_the_turned_livers_warn(livers_dir, phantom):
-    """All that are turned, and every ninth of the others."""
+    """All turned livers, and every ninth of the others."""
     others = [path for path in sorted(livers_dir.glob("*.obj")) if path.stem not in TURNED]
     files = [*(livers_dir / f"{name}.obj" for name in sorted(TURNED)), *others[::9]]
     gains, turned = turns(files, phantom)

@@ -1,4 +1,4 @@
-"""PLY in every layout of header and body, and the lesser oddities of other formats of meshes."""
+"""PLY in every layout of header and body, and rare features of other mesh formats."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from tests.helpers.mesh_mutations import encode, pristine
 
 FORMS = ("ascii", "binary_little_endian", "binary_big_endian")
 CODES = {"uchar": "u1", "short": "i2", "int": "i4", "uint32": "u4", "float": "f4", "double": "f8"}
-Row = list[tuple[str, Any]]  # types and numbers; of a list, the types of its length and numbers
+Row = list[tuple[str, Any]]  # types and numbers; for a list, the types of its length and numbers
 
 
 class PlyFile:
-    """Writes elements row by row, as text or as bytes of either order."""
+    """Writer of elements row by row, as text or as bytes of either order."""
 
     def __init__(self, form: str) -> None:
         self.form, self.head, self.body = form, f"ply\nformat {form} 1.0\ncomment c\n", b""
@@ -49,11 +49,11 @@ class PlyFile:
         return [np.array(number, order + CODES[code]).tobytes() for code, number in numbers]
 
     def camera(self) -> PlyFile:
-        """As PCL writes it."""
+        """Return a camera element as PCL writes it."""
         return self.element("camera", ["float view_px", "float view_py"], [[("float", 1.0)] * 2])
 
     def cube(self, faces: list[tuple[int, ...]] = TRIANGLES) -> PlyFile:
-        """Properties in an unusual order, normals, colours and texture on the faces."""
+        """Return properties in an unusual order, normals, colours and texture on the faces."""
         corners = [
             [("uchar", 7), ("float", z), ("double", x), ("float", y), ("float", 0.0)]
             for x, y, z in CUBE.tolist()
@@ -118,7 +118,7 @@ def test_what_is_wrong_is_said(tmp_path: Path, old: bytes, new: bytes, why: str)
 
 
 def coloured_off(content: bytes) -> bytes:
-    """Colours on vertices and faces, comments, and the counts behind the keyword."""
+    """Return colours on vertices and faces, comments, and the counts behind the keyword."""
     lines = content.splitlines()
     n = int(lines[1].split()[0])
     vertices = [line + b" 10 20 30 255" for line in lines[2 : 2 + n]]
@@ -139,7 +139,7 @@ ODD: dict[str, tuple[str, Callable[[bytes], bytes]]] = {
 @pytest.mark.parametrize("what", ODD)
 @pytest.mark.parametrize("name", ["1.2.840.113619.2.55", "ball.SUFFIX"])
 def test_what_other_programs_write_is_the_same_ball(tmp_path: Path, what: str, name: str) -> None:
-    """Also where the name does not tell the format."""
+    """The name need not tell the format."""
     kind, change = ODD[what]
     path = tmp_path / name.replace("SUFFIX", kind.partition("-")[0])
     path.write_bytes(change(encode(pristine(), kind)))
@@ -155,7 +155,7 @@ def test_what_other_programs_write_is_the_same_ball(tmp_path: Path, what: str, n
 @pytest.mark.parametrize("form", ["ASCII", "BINARY"])
 @pytest.mark.parametrize("version", [3.0, 5.1])
 def test_faces_of_an_unstructured_grid(tmp_path: Path, form: str, version: float) -> None:
-    """Triangles, quadrilaterals and a strip; lines and tetrahedra are none."""
+    """Triangles, quadrilaterals and a strip are faces; lines and tetrahedra are not."""
     file = VtkFile(form, version).text("DATASET UNSTRUCTURED_GRID")
     file.text("POINTS 8 float").numbers(CUBE.ravel(), ">f4")
     cells = [(0, 1), (0, 1, 2, 4), QUADS[0], *TRIANGLES[2:10], (1, 3, 5, 7)]

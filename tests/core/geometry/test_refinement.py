@@ -17,7 +17,7 @@ CENTER = np.array([0.05, 0.1, 0.05])
 
 
 def _edges(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Longest edge and centroid of each tetrahedron."""
+    """Return longest edge and centroid of each tetrahedron."""
     corners = mesh.vertices[mesh.tets]
     length = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=3)
     return length.max(axis=(1, 2)), corners.mean(axis=1)
@@ -35,7 +35,7 @@ def test_elements_are_as_small_as_asked_and_no_flatter(box: Box) -> None:
 
 def test_regions_keep_their_place(box: Box) -> None:
     mesh, regions = box(3)
-    edge = np.array([0.05, 0.1, 0.0])  # where the accessible side ends
+    edge = np.array([0.05, 0.1, 0.0])  # border of the accessible side
     fine, kept = refine(mesh, regions, [Grading(edge, UP, core=2e-3, radius=3e-3)])
     height = fine.vertices[fine.boundary_faces][:, :, 1]
     np.testing.assert_array_equal(kept.clamped, (height < 1e-9).all(axis=1))

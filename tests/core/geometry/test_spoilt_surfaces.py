@@ -1,7 +1,7 @@
 """Level sets of surfaces that are no clean boundary: open, overlapping, doubled, inside out, cut.
 
-Signs against the true solid, volumes against its own, |grad phi| = 1, or a refusal that names
-cause and remedy.
+Signs are checked against the true solid, volumes against its volume, and |grad phi| against 1;
+otherwise a refusal names cause and remedy.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from tests.helpers.known_surfaces import (
     written,
 )
 
-H = 4e-3  # spacing of the grids, if nothing else is said [m]
+H = 4e-3  # default spacing of the grids [m]
 WHOLE, COARSE = ball(), ball(level=3)
 UP = np.array([0.0, 0.0, RADIUS])
 # figures are only added to
@@ -233,7 +233,7 @@ def test_a_fissure_thinner_than_the_spacing(figure, width, turn, shift):
         assert np.array_equal(phi < 0, np.full(300, x != 0))
         if abs(x) == 0.6 * width:
             assert np.allclose(phi, -0.1 * width, rtol=1e-3, atol=1e-9)
-    # what the grid cannot show it leaves out: nothing of it deeper inside than a cell
+    # a feature below the grid's resolution is left out: nothing of it deeper inside than a cell
     zero = isosurface(grid)
     depth = -surface.skin.signed_distance(zero.vertices)
     assert depth.max() < spacing

@@ -1,4 +1,4 @@
-"""The front door: formats, unit, axes, and every way in which a surface can be wrong."""
+"""Reading a surface: formats, unit, axes, and every kind of faulty surface."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ASIDE = ball(centre=CENTRE, level=3)
 
 
 def encoded(folder: Path, surface: SurfaceMesh, kind: str, words: str) -> Path:
-    """A file with some words where 3D Slicer puts its ``SPACE=LPS``."""
+    """Write a file with some words where 3D Slicer puts its ``SPACE=LPS``."""
     path = folder / f"organ.{kind.partition('-')[0]}"
     path.write_bytes(encode(Soup(1e3 * surface.vertices, surface.faces), kind, words))
     return path
@@ -54,7 +54,7 @@ def test_every_format_gives_the_same_ball_in_metres(tmp_path, kind):
     assert surface.is_watertight
     assert len(surface.source_sha256) == 64
     assert surface.name == "ball"
-    if kind != "nii.gz":  # whose voxels are 10 mm
+    if kind != "nii.gz":  # its voxels are 10 mm
         # STL keeps single precision: 1e-7 of the radius
         assert np.allclose(np.linalg.norm(surface.vertices, axis=1), 0.06, rtol=1e-6)
         assert surface.volume == pytest.approx(0.000819385, rel=1e-5)
@@ -134,7 +134,7 @@ def test_axes_that_are_no_axes(axes):
 
 
 def lump() -> SurfaceMesh:
-    """A ball with a bump to the right, behind and above: no half-turn maps it onto itself."""
+    """Return a ball with a bump to the right, behind and above: no half-turn preserves it."""
     towards = np.array([0.6, -0.64, 0.48])
     bump = np.clip((ASIDE.vertices - CENTRE) @ towards / RADIUS, 0, 1)[:, None] ** 4
     return replace(ASIDE, vertices=ASIDE.vertices + 0.025 * bump * towards)
@@ -157,7 +157,7 @@ def test_a_file_that_states_lps_is_read_so(tmp_path, kind):
 
 
 def clamp_centre(surface: SurfaceMesh) -> np.ndarray:
-    """The middle of what the rule clamps, of tetrahedra about the middle of the surface."""
+    """Return the middle of the clamp by rule, on tetrahedra about the middle of the surface."""
     vertices = np.vstack([surface.vertices, surface.vertices.mean(axis=0)])
     middle = np.full(len(surface.faces), len(surface.vertices))
     mesh = TetMesh(vertices, np.column_stack([surface.faces[:, ::-1], middle]))
@@ -259,7 +259,7 @@ def test_faces_beyond_the_vertices(tmp_path):
 
 
 def half(surface: SurfaceMesh, normal: np.ndarray, share: float = 0.5) -> SurfaceMesh:
-    """The faces on one side of a plane, that share of them."""
+    """Return the faces on one side of a plane, up to a fraction of them."""
     height = surface.vertices[surface.faces].mean(axis=1) @ normal
     return replace(surface, faces=surface.faces[height > np.quantile(height, 1 - share)])
 

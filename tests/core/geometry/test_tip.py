@@ -1,4 +1,4 @@
-"""Shapes of tips: Sneddon's depth against its integral, and the table of shapes on a page."""
+"""Shapes of tips: Sneddon's depth against its integral, and the page's table of shapes."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from avatar_core.geometry.tip import Tip
 from tests.helpers.paths import ROOT
 from tests.helpers.tips import one_of_each, used_by
 
-RADII = 4e-3 * np.array([0.05, 0.3, 0.5, 0.8, 0.95])  # of contacts [m]
-NO_LOAD = "patch"  # which is no tool, and has no depth
+RADII = 4e-3 * np.array([0.05, 0.3, 0.5, 0.8, 0.95])  # contact radii [m]
+NO_LOAD = "patch"  # no tool: it has no depth
 
 
 @pytest.mark.parametrize("tip", one_of_each(), ids=lambda tip: tip.shape)

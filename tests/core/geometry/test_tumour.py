@@ -1,4 +1,4 @@
-"""A tumour under a tip: what it stores of the energy, and how much stiffer the tip feels it."""
+"""A tumour under a tip: its part of the stored energy, and its effect on the stiffness."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_half_of_the_tissue_stores_half_of_the_energy() -> None:
 
 @pytest.mark.parametrize("depth", [4e-3, 8e-3, 12e-3])
 def test_energy_falls_with_the_distance(depth: float) -> None:
-    """Within r it is 1 - 3 a / (4 r) of all, a the contact's radius."""
+    """Within r it is 1 - 3 a / (4 r) of the total, with a the contact radius."""
     within = fraction(ball(np.zeros(3), depth))
     total = 1.0 - 0.75 * RADIUS / REACH
     assert within == pytest.approx((1.0 - 0.75 * RADIUS / depth) / total, abs=0.06)
@@ -100,7 +100,7 @@ def test_a_file_keeps_it(tmp_path) -> None:  # type: ignore[no-untyped-def]
 
 @pytest.mark.long
 def test_a_tip_over_a_tumour_feels_a_resolved_contact() -> None:
-    """Without the tumour's own stiffness the tip would feel half of the true force."""
+    """Without the tumour's own stiffness the force would be half of the true one."""
     harder, place, depths = _cube_with_tumour(), top("cube"), (2e-3, 5e-3)
     tips = [Tip("sphere", radius) for radius in (3e-3, 5e-3)]
     inside = (tumour(), CONTRAST)

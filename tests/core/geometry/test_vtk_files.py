@@ -1,4 +1,4 @@
-"""Polygonal data in legacy and XML files of VTK: each layout gives the same surface, or why not."""
+"""Polygonal data in legacy and XML VTK files: each layout gives the same surface or a refusal."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FORMS = [("ASCII", 3.0), ("BINARY", 3.0), ("ASCII", 5.1), ("BINARY", 5.1)]
 
 
 class VtkFile:
-    """Writes a file section by section, with numbers as text or as big-endian bytes."""
+    """Writer of a file section by section, with numbers as text or as big-endian bytes."""
 
     def __init__(self, form: str, version: float) -> None:
         self.form, self.version = form, version
@@ -98,7 +98,7 @@ def test_what_is_no_surface_is_skipped(tmp_path: Path, form: str, version: float
     file.text("FIELD FieldData 3").text("TIME 1 1 double").numbers([1.5], ">f8")
     file.text("METADATA").text("COMPONENT_NAMES").text("POLYGONS").text("")
     file.text("source 1 2 string")
-    for name in ("one%20name", "x" * 70):  # longer than a length of one byte holds
+    for name in ("one%20name", "x" * 70):  # longer than a length of one byte allows
         length = (
             bytes([192 + len(name)]) if len(name) < 64 else struct.pack(">H", 2**15 + len(name))
         )
@@ -121,7 +121,7 @@ def test_polygons_of_one_and_two_corners_are_no_triangles(tmp_path: Path) -> Non
 @pytest.mark.parametrize(("form", "version"), FORMS)
 def test_a_file_cut_anywhere_is_refused(tmp_path: Path, form: str, version: float) -> None:
     whole = VtkFile(form, version).points().cells("POLYGONS", TRIANGLES).content
-    last_number = 3 if form == "ASCII" else 2  # without it, a number or a byte of one is missing
+    last_number = 3 if form == "ASCII" else 2  # without it, a number or one byte is missing
     path = tmp_path / "cube.vtk"
     for n_bytes in range(len(whole) - last_number + 1):
         path.write_bytes(whole[:n_bytes])

@@ -1,4 +1,4 @@
-"""Limits, ramps and engagement of the force that is sent."""
+"""Limits, ramps and engagement of the sent force."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LIMITS = ForceLimits(5.0, 1000.0)
 
 
 class Drive:
-    """A guard that is updated period by period; keeps what was sent."""
+    """A guard that is updated period by period; it keeps the sent forces."""
 
     def __init__(self, limits: ForceLimits = LIMITS) -> None:
         self.guard = ForceGuard(limits)
@@ -48,7 +48,7 @@ class Drive:
 def test_ordinary_forces_go_through_to_the_bit() -> None:
     drive = Drive(DEVICES["sigma"])
     drive.engage(np.zeros(3))
-    for k in range(1000):  # 15 N, 5 times a second, as of a palpating hand
+    for k in range(1000):  # 15 N, 5 times a second, as in palpation by hand
         force = 7.5 * (1.0 - math.cos(2 * math.pi * 5 * k * PERIOD)) * np.array([0.6, 0.0, 0.8])
         np.testing.assert_array_equal(drive.step(force)[:3], force)
         assert not drive.guard.limited and drive.guard.sent_fraction == 1.0
@@ -76,13 +76,13 @@ def test_engagement_is_soft() -> None:
 
 
 def test_a_fault_ramps_down_whatever_the_slew_is_and_latches() -> None:
-    drive = Drive(ForceLimits(5.0, 10.0))  # of its own, slew would take half a second
+    drive = Drive(ForceLimits(5.0, 10.0))  # the slew limit alone would take half a second
     drive.engage(np.array([0.0, 0.0, 0.5]))
     for _ in range(1000):
         drive.step(np.array([0.0, 0.0, 4.0]))
     before = drive.sent[-1].copy()
     n = len(drive.sent)
-    drive.step(np.array([9.0, 9.0, 9.0]), sound=False)  # one period, then all is well
+    drive.step(np.array([9.0, 9.0, 9.0]), sound=False)  # one faulty period, then sound ones
     for _ in range(round(SETTLING / PERIOD)):
         drive.step(np.array([9.0, 9.0, 9.0]))
     fallen = np.array(drive.sent)[n:]
@@ -107,7 +107,7 @@ STRETCH = st.tuples(st.booleans(), st.integers(1, 120), FORCES, FORCES, PERIODS)
 def test_nothing_that_comes_breaks_a_limit(
     stretches: list[tuple[bool, int, float, float, float]],
 ) -> None:
-    """Size always; slew but in a ramp; none from 10 ms after a fault to 50 ms of sound poses."""
+    """Size always; slew except in a ramp; none from 10 ms after a fault to 50 ms of sound poses."""
     drive = Drive()
     last, fault, sound_since = np.zeros(6), -math.inf, math.inf
     for sound, n, x, z, period in stretches:

@@ -1,20 +1,20 @@
 """Closed haptic loops: a tool in a hand, the organ's 1 kHz step, its force late and held.
 
-The tool is a linear device, its motion exact within each period, so that the energy which goes
-through the port, E = - sum F . (x' - x), is exact too.
+The tool is a linear device, and its motion is exact within each period. So the energy through the
+port, E = - sum F . (x' - x), is exact too.
 
 The quantisation bound. The controller sees readings x^ = x - e, |e| <= h = sqrt(3) q / 2, q their
-step. What it observes, E^, differs from E by the work of F on the errors, summed by parts, and, in
-periods in which no coordinate's reading changed by more than q, by counting the organ's own mean
-force m = (f + f') / 2 for F:
+step. Its observed energy E^ differs from E by the work of F on the errors, summed by parts. In
+periods in which no coordinate's reading changed by more than q, it counts the organ's own mean
+force m = (f + f') / 2 instead of F:
 
     E - E^ = - sum F_k . (e_k+1 - e_k) - sum_slow (F_k - m_k) . (x^_k+1 - x^_k)
            = - F_n . e_n+1 + sum (F_k - F_k-1) . e_k - sum_slow (F_k - m_k) . (x^_k+1 - x^_k),
 
 so |E - E^| <= Q = h |F_n| + h sum |F_k - F_k-1| + 2 h sum_slow |F_k - m_k|. The controller holds
-only forces that keep E^ + (E' - E) >= - bound for all that the tool may do until they end; hence
-E >= - bound - max Q, whatever the organ does, if the tool's acceleration is what it was told.
-Reading errors of a tool that moves average out, and E >= - bound itself is what is found.
+only forces that keep E^ + (E' - E) >= - bound for any motion of the tool until they end. Hence
+E >= - bound - max Q for any organ, if the tool's acceleration stays below the assumed one. Reading
+errors of a moving tool average out, and the tests find E >= - bound itself.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from tests.helpers.examples import examples
 from tests.helpers.flat_organ import BALL, RADIUS, flat_organ
 
 RESOLUTION = 1e-5  # [m]
-ACCELERATION = 100.0  # what the controller is told [m/s^2]
+ACCELERATION = 100.0  # acceleration that the controller assumes [m/s^2]
 STIFFNESSES = (400.0, 1000.0, 2500.0)  # [N/m]
 MASSES, DAMPINGS, GRIPS = (0.1, 0.3, 1.0), (0.1, 0.5, 5.0), (0.0, 100.0, 1000.0)
 DELAYS = (1, 2)  # periods
@@ -54,17 +54,17 @@ class Run(NamedTuple):
 
     @property
     def given(self) -> float:
-        """Energy that the port has given at worst [J]."""
+        """Return the largest energy that the port has given [J]."""
         return max(0.0, -float(self.energy.min()))
 
     @property
     def acceleration(self) -> float:
-        """Largest change of the mean velocity of a period, over the period [m/s^2]."""
+        """Return the largest change of a period's mean velocity per period [m/s^2]."""
         change = np.linalg.norm(np.diff(self.position, 2, axis=0), axis=1)
         return float(change.max()) / PERIOD**2
 
     def quantisation(self, q: float) -> float:
-        """Q after the last period, its sums only grow [J]."""
+        """Return Q after the last period [J]; its sums only grow."""
         h = 0.5 * np.sqrt(3.0) * q
         steps = np.diff(self.held, axis=0, prepend=np.zeros((1, 3)))
         slow = (np.abs(np.diff(self.reading, axis=0)) < 1.5 * q).all(axis=1)
@@ -83,7 +83,7 @@ def closed_loop(
     passivity: Passivity | None,
     q: float = RESOLUTION,
 ) -> Run:
-    """The loop with the organ's own step, from rest at ``start``; push (n, 3) of the hand [N]."""
+    """Run the loop with the organ's step from rest at ``start``; push (n, 3) of the hand [N]."""
     a, b = device.transition()
     organ.reset()
     n = len(push)
@@ -119,7 +119,7 @@ def controller(delay: int, q: float = RESOLUTION) -> Passivity:
 
 @pytest.mark.parametrize("delay", DELAYS)
 def test_port_is_passive_for_every_tool_and_grip(delay: int) -> None:
-    """With the spring of the study, whose forces are those of the organ's step (below)."""
+    """The organ is the study's spring, whose forces equal those of the organ's step (below)."""
     free, bound = 0.0, controller(delay).bound
     cases = itertools.product(HANDS, MASSES, DAMPINGS, GRIPS, STIFFNESSES)
     for hand, mass, damping, grip, stiffness in cases:
@@ -157,15 +157,15 @@ def test_port_is_passive_on_a_ball(delay: int) -> None:
     assert np.ptp(run.position[:, 0]) > 2e-3
     assert run.given <= passivity.bound < free.given
     assert run.acceleration < ACCELERATION
-    # what the controller keeps account of is what went through the port
+    # the controller's account equals the energy through the port
     assert abs(passivity.energy[0] - run.energy[-2]) <= run.quantisation(RESOLUTION)
 
 
-# --- Whatever hand and organ do -----------------------------------------------------------------
+# --- Any hand and organ -------------------------------------------------------------------------
 
 
 def shaken(seed: int, active: str, delay: int, q: float, n: int = 300) -> tuple[Run, Passivity]:
-    """A tool that is thrown about, on an organ that pushes it as it likes."""
+    """Throw a tool about, on an organ that pushes it at will."""
     rng = np.random.default_rng(seed)
     passivity = make_passivity(1, delay, q)
     turn = rng.standard_normal((n, 3))
@@ -187,7 +187,7 @@ def shaken(seed: int, active: str, delay: int, q: float, n: int = 300) -> tuple[
         run.organ[k] = force[0]
         limit(passivity, run.reading[k : k + 1], force)
         sent[k + delay] = force[0]
-        if active == "along":  # the worst of hands: towards the force that is held
+        if active == "along":  # the worst of hands: towards the held force
             push[k] = 100.0 * sent[k] / (np.linalg.norm(sent[k]) + 1e-12) * rng.uniform(-1.0, 1.0)
         at = PERIOD * np.array([0.25, 0.5, 0.75, 1.0])[:, None]  # between the samples too
         way = at * v + 0.5 * at**2 * push[k]
@@ -209,7 +209,7 @@ def shaken(seed: int, active: str, delay: int, q: float, n: int = 300) -> tuple[
 def test_bound_holds_for_any_force_and_any_motion(
     seed: int, active: str, delay: int, q: float
 ) -> None:
-    """An active organ spends what the bound allows, and no more."""
+    """An active organ spends the energy that the bound allows, and no more."""
     run, passivity = shaken(seed, active, delay, q)
     exact = passivity.bound * (1.0 + 1e-9)  # sums of 300 terms
     assert run.given <= exact + (run.quantisation(q) if q > 0.0 else 0.0)
@@ -221,9 +221,9 @@ def test_bound_holds_for_any_force_and_any_motion(
 
 
 def test_control_takes_what_the_loop_made_and_no_more() -> None:
-    """Pressed into the organ, a tool that would swing up fades as on an organ without delay.
+    """Pressed into the organ, an oscillating tool decays as on an organ without delay.
 
-    Its swings have the envelope exp(- b t / 2 m) there, all energy being the tool's own to lose.
+    Its oscillations have the envelope exp(- b t / 2 m), all energy being the tool's own to lose.
     """
     mass, damping, stiffness, depth, swing, n = 0.3, 1.0, 800.0, 5e-3, 2e-3, 1500
     push = np.full(n, -stiffness * depth)
@@ -241,4 +241,5 @@ def test_control_takes_what_the_loop_made_and_no_more() -> None:
     tolerance = make_passivity(1, 2, RESOLUTION).tolerance
     assert lasts["without"] > swing
     assert energy["with"] <= 0.5 * stiffness * ideal**2 + 2.0 * tolerance
-    assert lasts["with"] == pytest.approx(ideal, rel=0.05)  # nor does it brake what is the tool's
+    # nor does it brake the tool's own motion
+    assert lasts["with"] == pytest.approx(ideal, rel=0.05)

@@ -1,4 +1,4 @@
-"""Passivity control: silent when there is nothing to do, exact when there is, never insane."""
+"""Passivity control: silent when nothing is to be done, exact otherwise, always finite."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ STIFFNESS = 1000.0  # [N/m]
 
 
 def pushed(passivity: Passivity, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Forces of a spring along z and what is sent, (n,), for a path into it (n,)."""
+    """Return forces of a spring along z and the sent ones, (n,), for a path into it (n,)."""
     organ, sent = STIFFNESS * np.maximum(depth, 0.0), np.zeros(len(depth))
     for k, into in enumerate(depth):
         force = np.array([[0.0, 0.0, organ[k]]])
@@ -38,7 +38,7 @@ def test_forces_of_a_slow_tool_are_unchanged_to_the_bit(delay: int, resolution: 
 
 
 def test_a_tool_at_rest_and_a_free_tool_are_left_alone() -> None:
-    """Nothing moves, whatever the force: no work. No force: no work, however it moves."""
+    """Without motion no force works; without force no motion works."""
     rng = np.random.default_rng(0)
     passivity = make_passivity(2, 1, 1e-5)
     for k in range(200):
@@ -51,7 +51,7 @@ def test_a_tool_at_rest_and_a_free_tool_are_left_alone() -> None:
 
 @pytest.mark.parametrize("delay", [0, 1, 2])
 def test_the_bounding_is_not_felt_up_to_its_stiffness_and_speed(delay: int) -> None:
-    """In and out at 0.1 m/s: the same to the bit as without it; out at 0.5 m/s it is felt."""
+    """In and out at 0.1 m/s: the same to the bit as without it; out at 0.5 m/s it acts."""
     way = 1e-4 * np.concatenate([np.arange(-5.0, 50.0), np.full(20, 50.0)])
     for speed, felt in ((0.1, False), (0.5, True)):
         path = np.concatenate([way, np.arange(50e-4, -10e-4, -speed * PERIOD)])
@@ -75,14 +75,14 @@ def test_the_missing_energy_is_dissipated_exactly(delay: int) -> None:
     late = np.array(created[2 * delay + 20 :])
     # sums of 100 terms of 1e-4 J in double precision
     np.testing.assert_allclose(late, passivity.tolerance, atol=1e-15)
-    # what it adds is the damping of the border, K (T / 2 + delay T)
+    # it adds the damping of the border, K (T / 2 + delay T)
     added = force[0, 2] - STIFFNESS * (2e-3 + step * (n - 1))
     border = STIFFNESS * PERIOD * (0.5 + delay)
     assert added == pytest.approx(border * speed, rel=1e-9)
 
 
 def test_added_damping_is_bounded_and_against_the_motion() -> None:
-    """An organ that drives the tool on, in all directions, and no other bound."""
+    """An organ drives the tool on, in all directions, without another bound."""
     rng = np.random.default_rng(1)
     passivity = make_passivity(1, 1, 0.0, stiffness=math.inf, damping=7.0)
     tip, worst = np.zeros((1, 3)), 0.0
@@ -102,7 +102,7 @@ def test_added_damping_is_bounded_and_against_the_motion() -> None:
 
 
 def test_a_surplus_is_not_saved_up_for_later() -> None:
-    """An organ that softens while the tool goes in takes 0.4 mJ too much; then a spring's leak."""
+    """An organ that softens while the tool goes in takes 0.4 mJ too much; then a spring leaks."""
     passivity = make_passivity(1, 0, 0.0, stiffness=math.inf)
     step = 5e-5
     for k in range(100):
@@ -156,12 +156,12 @@ def test_what_is_not_finite_gets_no_force_and_leaves_no_trace(value: float, of: 
             assert force[0, 2] == 1e-2 * k
         assert force[1, 2] == 1e-2 * k
     assert all(np.isfinite(array).all() for array in passivity[6:])
-    # 60 periods less the gap: what happened in it is not counted
+    # 60 periods less the gap, which is not counted
     assert 0.0 < passivity.energy[0] < passivity.energy[1]
 
 
 def test_a_tool_put_elsewhere_does_no_work() -> None:
-    """As a tool without a pose is, for the step: 1 km away."""
+    """For the step, a tool without a pose is 1 km away."""
     passivity = make_passivity(1, 0, 0.0, tolerance=1e-3)
     organ, sent = pushed(passivity, np.linspace(0.0, 3e-3, 300))
     assert sent[-1] == organ[-1] > 0.0

@@ -12,7 +12,7 @@ CALM_WINDOW, BUSY = (0.0, 50e-6), (0.05, 50e-6)
 
 
 def test_missed_periods_shed_a_level_each_and_never_the_last() -> None:
-    """Rest takes all back at once, calm one by one."""
+    """``rest`` takes all levels back at once, calm periods one by one."""
     shedder = Shedder(LEVELS)
     assert [shedder.update(*BUSY) for _ in range(5)] == [40, 20, 10, 10, 10]
     assert shedder.is_shedding
@@ -39,7 +39,7 @@ def test_between_calm_and_overloaded_nothing_changes() -> None:
 
 
 def test_a_level_that_is_too_many_is_tried_ever_more_rarely() -> None:
-    """A machine that bears 40 modes and not 80: changes must not go on at the same rate."""
+    """A machine can compute 40 modes but not 80: changes must not go on at the same rate."""
     shedder = Shedder(LEVELS)
     changes, before = [], shedder.modes
     for window in range(400):

@@ -48,7 +48,7 @@ from tests.helpers.soft_organ import (
     soft_tumour,
 )
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds organs
 
 
 @pytest.fixture(scope="module")
@@ -205,9 +205,9 @@ def _point(position: int) -> tuple[np.ndarray, np.ndarray]:
 def test_a_hard_inclusion_is_felt(
     organ: Vademecum, problem: Elasticity, tumour: SurfaceMesh
 ) -> None:
-    """The force rises over the tumour as full finite elements say, and only if the scene has it.
+    """The force rises over the tumour as in full finite elements, only if the scene has it.
 
-    Of the patch, which full finite elements are loaded by.
+    The tip is the patch, which loads the full finite elements.
     """
     surface = organ.surface
     distance = np.linalg.norm(surface.centers - tumour.vertices.mean(axis=0), axis=1)
@@ -261,7 +261,7 @@ def test_it_is_read_as_it_was_written(organ: Vademecum, tmp_path: Path) -> None:
     np.testing.assert_array_equal(one.contact_near.block, other.contact_near.block)
 
 
-# --- what is refused --------------------------------------------------------------------------
+# --- refusals ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -311,7 +311,7 @@ def test_an_incompressible_organ_with_a_tumour_is_refused(organ: Vademecum) -> N
 
 @pytest.mark.long
 def test_towards_incompressibility_on_taylor_hood() -> None:
-    """Poisson's ratio up to 0.499, where the canonical separated form stagnates."""
+    """Poisson's ratio goes up to 0.499, where the canonical separated form stagnates."""
     options = OrganOptions(
         n_displayed=0,
         n_vertices=800,
@@ -350,7 +350,7 @@ def held(springs: Vademecum) -> Elasticity:
 
 
 def misses(here: Vademecum, held: Elasticity, positions: np.ndarray) -> np.ndarray:
-    """Relative L2 errors of the displacement under unit loads at load positions, (3 n,)."""
+    """Return relative L2 errors of the displacement under unit loads at load positions, (3 n,)."""
     loads = patch_loads(held, here.surface.centers[positions], here.surface.patch_radius)
     exact = held.at_vertices(held.solve(loads))
     found = np.hstack([here.displacement(np.array([j]), np.ones(1)) for j in positions])
@@ -388,7 +388,7 @@ def test_between_its_nodes_it_answers_by_full_finite_elements(
         values = {BARE: stiffness}
         found.append(misses(springs.at(values), problem_at(held, values), some_positions(springs)))
     assert np.mean(found) < 0.08  # three nodes over four decades
-    # another stiffness of this size is another answer altogether
+    # a wrong stiffness of this size gives another result altogether
     wrong = misses(springs.at({BARE: 3e5}), problem_at(held, {BARE: 3e6}), np.array([3]))
     assert wrong.min() > 0.5
 
@@ -412,7 +412,7 @@ def test_with_another_modulus_the_springs_keep_their_stiffness(
 def test_a_stiffness_out_of_range_is_refused_with_the_range(springs: Vademecum) -> None:
     with pytest.raises(CoordinateError, match=r"holds 100000 to 1e\+09"):
         springs.at({BARE: 1e10})
-    # at a tenth of the modulus, springs of 1e9 are as those of 1e10 are here
+    # at a tenth of the modulus, springs of 1e9 equal those of 1e10 here
     with pytest.raises(CoordinateError, match=r"at this Young's modulus .* 10000 to 1e\+08"):
         springs.at({BARE: 1e9, "young": 0.017e6})
     with pytest.raises(CoordinateError, match="--support falciform=LOW:HIGH"):

@@ -1,4 +1,4 @@
-"""The full solutions of a build: single precision where it serves, else double, on all cores."""
+"""Full solutions of a build: single precision where it suffices, else double, on all cores."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DOUBLE = 1e-6  # columns are kept in float32
 
 
 def found(elasticity: Elasticity) -> tuple[FullResponse, float]:
-    """The response of a box, and the largest error of its columns, relative to the largest."""
+    """Compute a box's response and the largest error of its columns, relative to the largest."""
     surface = load_surface(elasticity.mesh, box_regions(elasticity.mesh), 0.03)
     loads = patch_loads(elasticity, surface.centers, surface.patch_radius)
     response = full_response(elasticity, loads, silent)
@@ -53,7 +53,7 @@ def test_any_number_of_cores_gives_the_same_bits(
 def test_loads_that_single_precision_does_not_solve_are_solved_in_double(
     elasticity: Elasticity, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The error that is tried exceeds what is tolerated."""
+    """The residual of single precision exceeds the tolerance."""
     error = elasticity.single_error(
         patch_loads(elasticity, elasticity.mesh.vertices[[-1]], 0.03).tocsc()
     )

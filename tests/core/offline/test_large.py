@@ -1,4 +1,4 @@
-"""Load magnitude as a coordinate: the series, what is stored of it, and contact with it."""
+"""Load magnitude as a coordinate: the series, its stored part, and contact with it."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_powers_go_on_tangentially() -> None:
 
 
 def test_economised_terms_stand_for_the_whole_series() -> None:
-    """As far from x^4 and x^5 as stated, and no farther, over the whole reach."""
+    """It is as far from x^4 and x^5 as stated, over the whole reach."""
     reach, a = 0.02, np.linspace(1e-4, 0.02, 400)
     for order, left in ((4, 0.0385), (5, 0.0754)):
         terms = np.zeros((5, 1))
@@ -85,14 +85,14 @@ def test_economised_terms_stand_for_the_whole_series() -> None:
         assert off.max() == pytest.approx(left, rel=0.01)
 
 
-# --- what is stored ---------------------------------------------------------------------------
+# --- the stored part --------------------------------------------------------------------------
 
 
 @pytest.mark.long
 def test_pushes_at_load_positions_are_right_where_linear_ones_are_not(bent: Vademecum) -> None:
-    """There nothing is interpolated: what is left is of the terms and the modes.
+    """Without interpolation there, errors come from the terms and the modes.
 
-    Of the terms, the rule lets the deeper push, close to the reach, be wrong by its tolerance.
+    The rule lets the terms of the deeper push, close to the reach, be wrong by its tolerance.
     """
     problem, surface = hyperelastic_problem(bent, "neo-hookean"), bent.surface
     distance = np.linalg.norm(surface.centers - surface.centers[middle_of_access(bent)], axis=1)
@@ -150,25 +150,25 @@ FIGURES = ("oblique_contact_mean", "two_tools_contact_mean", "gravity_contact_me
 
 
 def combined_rows(*errors: float) -> list[CombinedRow]:
-    """One push of each combination."""
+    """Return one push of each combination."""
     pairs = zip(COMBINATIONS, errors, strict=True)
     return [CombinedRow(name, 0, 10e-3, error, 1.0, True) for name, error in pairs]
 
 
 def certified(bent: Vademecum, certificate: LargeCertificate | None = None) -> Vademecum:
-    """With a certificate of no push, unless another is given."""
+    """Return the vademecum with a certificate of no push, unless another is given."""
     return bent.with_large_certificate(certificate or summary(bent, [], 0, 0))
 
 
 @pytest.mark.long
 def test_what_is_added_linearly_to_a_large_push_is_nearly_right(bent: Vademecum) -> None:
-    """Wrong by less than half; at three sites less than without the bending of each tip itself."""
+    """Its error is below half; at three sites it is less than without the tips' own bending."""
     shares: list[float] = []
     problem = hyperelastic_problem(bent, "neo-hookean")
     rows = push_errors(bent, problem, (5e-3,), 3, progress=shares.append)
     assert [row.combination for row in rows] == 3 * list(COMBINATIONS)
     assert shares == sorted(shares) and shares[-1] == 1.0
-    assert len(shares) > 27  # each Newton iteration says so
+    assert len(shares) > 27  # each Newton iteration reports
     for row in rows:
         assert row.within and row.depth == 5e-3
         assert row.contact < 0.5
@@ -199,7 +199,7 @@ def test_figures_are_of_pushes_within_the_range() -> None:
 def test_a_build_measures_combinations_at_few_of_its_sites(
     bent: Vademecum, monkeypatch: pytest.MonkeyPatch, n_pushed: int, n_combined: int
 ) -> None:
-    """As deep as three quarters of what is aimed at, and the bar goes on without a jump back."""
+    """At least three quarters of the target depth, and the bar advances without a jump back."""
     asked: list[tuple[object, int]] = []
 
     def pushed(vademecum, problem, n, depth, seed, progress):  # type: ignore[no-untyped-def]
@@ -272,7 +272,7 @@ def test_show_tells_what_combinations_cost(
 
 @pytest.mark.long
 def test_a_patch_feels_the_bent_force(bent: Vademecum, data: ContactData) -> None:
-    """As the file says at the load position, but for the smoothing of what a tip feels."""
+    """The force equals the file's at the load position, except for the smoothing of a tip."""
     middle = bent.surface.centers[middle_of_access(bent)]
     distance = np.linalg.norm(bent.surface.centers - middle, axis=1)
     for j in np.argsort(distance)[:8:2]:
@@ -292,10 +292,10 @@ def test_a_patch_feels_the_bent_force(bent: Vademecum, data: ContactData) -> Non
 
 
 def test_a_deep_push_is_as_right_as_a_light_one(bent: Vademecum, data: ContactData) -> None:
-    """At all depths the step feels what the vademecum itself says of the load position.
+    """At all depths the step's force equals the vademecum's at the load position.
 
-    A wider kernel would take the response of faces beside and behind into that of a deep tip,
-    which would then be too stiff.
+    A wider kernel would mix the response of faces beside and behind into that of a deep tip, which
+    would then be too stiff.
     """
     ratio = []
     for j in inner_positions(bent)[::4]:
@@ -314,7 +314,7 @@ def test_a_deep_push_is_as_right_as_a_light_one(bent: Vademecum, data: ContactDa
 
 
 def test_cloud_is_the_bent_field(bent: Vademecum, data: ContactData) -> None:
-    """Linear under the force, and bent as at the depth that the tip feels."""
+    """The cloud is linear under the force, and bent as at the depth of the tip."""
     v, state = bent, data.state
     j = middle_of_access(v)
     step(data, tip_at(v, 4e-3, j))
@@ -335,7 +335,7 @@ def test_cloud_is_the_bent_field(bent: Vademecum, data: ContactData) -> None:
 
 @pytest.mark.parametrize("share", [0.5, 1.8])
 def test_force_is_the_derivative_of_the_energy(bent: Vademecum, share: float) -> None:
-    """Within the stored range, and where it goes on tangentially."""
+    """Within the stored range, and in its tangential extension."""
     assert bent.large is not None
     short = replace(bent, large=replace(bent.large, reach=np.full_like(bent.large.reach, 8e-3)))
     data = prepare(short, (PATCH,), cloud="volume")  # the compiled step of the other tests

@@ -28,7 +28,7 @@ from avatar_core.vademecum.resected import margins, part_volumes
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from tests.helpers.soft_organ import cut_organ, soft_organ, soft_tumour
 
-pytestmark = pytest.mark.long  # for the organ that it builds
+pytestmark = pytest.mark.long  # it builds an organ
 
 OPENED = Coordinate("resection", 0.0, 1.0)
 
@@ -46,7 +46,7 @@ def problem(organ: Vademecum) -> Elasticity:
 
 
 def misses(here: Vademecum, problem: Elasticity) -> np.ndarray:
-    """Relative L2 errors of the displacement under unit loads at some load positions."""
+    """Return relative L2 errors of the displacement under unit loads at some load positions."""
     some = np.linspace(0, here.surface.n_positions - 1, 8).astype(int)
     loads = patch_loads(problem, here.surface.centers[some], here.surface.patch_radius)
     exact = problem.at_vertices(problem.solve(loads))

@@ -1,4 +1,4 @@
-"""One field over regions and blocks: what it holds, beside the fields that it was separated of."""
+"""One field over regions and blocks, against the fields that it separates."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def blocks(points: np.ndarray) -> Blocks:
 
 @pytest.fixture(scope="module")
 def shared(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two smooth modes, and their amounts in each load."""
+    """Return two smooth modes, and their amounts in each load."""
     smooth = np.stack([np.sin(3.0 * points), np.cos(2.0 * points)], axis=2).reshape(3 * N, 2)
     load = np.random.default_rng(1).standard_normal((N_POSITIONS, 3, N_SHARED))
     return smooth, load.astype(np.float32)
@@ -43,7 +43,7 @@ def shared(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def regions(points: np.ndarray) -> list[RegionModes]:
-    """Modes of what each load moves: bumps near places on a line."""
+    """Return modes of each load's displacement: bumps near places on a line."""
     places = np.column_stack([np.linspace(0.0, 1.0, N_POSITIONS), np.full((N_POSITIONS, 2), 0.5)])
     bump = np.exp(-40.0 * ((points[:, None] - places) ** 2).sum(axis=2))
     columns = np.einsum("vp,dl->vdpl", bump, np.eye(3)).reshape(3 * N, N_POSITIONS, 3)
@@ -62,7 +62,7 @@ def field(
 
 @pytest.fixture(scope="module")
 def exact(shared: tuple[np.ndarray, np.ndarray], regions: list[RegionModes]) -> np.ndarray:
-    """The columns that were separated, shape (3 N, n_positions, 3)."""
+    """Return the separated columns, shape (3 N, n_positions, 3)."""
     out = np.einsum("xk,plk->xpl", *shared)
     for r, (space, load) in enumerate(regions):
         out[:, r == REGION] += np.einsum("xk,plk->xpl", space, load)

@@ -1,4 +1,4 @@
-"""Fields separated block by block: what is left is told, least, and what a step shows."""
+"""Fields separated block by block: stated and least errors, and the step's display."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MASS = np.linspace(0.5, 2.0, N_BLOCKS * SIZE).reshape(N_BLOCKS, SIZE)
 
 @pytest.fixture
 def fields() -> np.ndarray:
-    """Modes that are rough in the first blocks and smooth in the last, as far from a touch."""
+    """Return fields that are rough in the first blocks and smooth in the last, far from a touch."""
     x = np.linspace(0.0, 1.0, N_BLOCKS * SIZE)[:, None]
     s = np.linspace(0.0, 0.15, N_MODES)[None]
     whole = 1.0 / (0.02 + np.abs(x - s)) + 3.0 * np.sin(5.0 * x * (1.0 + s))
@@ -32,7 +32,7 @@ def loads() -> np.ndarray:
 
 
 def shown(modes: BlockModes, loads: np.ndarray, level: int = 10**6) -> np.ndarray:
-    """The field of each load with the modes up to a level, shape (n_loads, n_blocks, size)."""
+    """Return each load's field with the modes up to a level, (n_loads, n_blocks, size)."""
     out = np.zeros((len(loads), N_BLOCKS, SIZE))
     for b in range(N_BLOCKS):
         rows = np.arange(modes.start[b], modes.start[b + 1])
@@ -42,7 +42,7 @@ def shown(modes: BlockModes, loads: np.ndarray, level: int = 10**6) -> np.ndarra
 
 
 def left(found: np.ndarray, fields: np.ndarray, loads: np.ndarray) -> np.ndarray:
-    """Relative L2 error of each load."""
+    """Return the relative L2 error of each load."""
     exact = np.einsum("bim,lm->lbi", fields, loads)
     size = np.sqrt((MASS * exact**2).sum(axis=(1, 2)))
     return np.asarray(np.sqrt((MASS * (found - exact) ** 2).sum(axis=(1, 2))) / size)
@@ -60,7 +60,7 @@ def test_the_tolerance_is_kept_with_no_mode_too_many(
     modes = separate_blocks(fields, MASS, loads, sizes, tolerance)
     found = shown(modes, loads)
     assert rms(left(found, fields, loads)) <= 1.01 * tolerance
-    # without the weakest mode that is kept, it would not be
+    # without the weakest kept mode it would not be
     weakest = modes.level.max()
     fewer = shown(modes, loads, weakest - 1)
     assert rms(left(fewer, fields, loads)) > tolerance
@@ -69,7 +69,7 @@ def test_the_tolerance_is_kept_with_no_mode_too_many(
 def test_rough_blocks_get_more_modes_than_smooth_ones(
     fields: np.ndarray, loads: np.ndarray
 ) -> None:
-    """And fewer in all than where every block has as many."""
+    """The total is less than with equal numbers in all blocks."""
     sizes = load_sizes(fields, MASS, loads)
     modes = separate_blocks(fields, MASS, loads, sizes, 1e-3)
     counts = np.diff(modes.start)
@@ -99,7 +99,7 @@ def test_levels_count_the_modes_of_a_block_in_the_mean(
 
 
 def test_all_modes_serve_amplitudes_that_no_load_has(fields: np.ndarray) -> None:
-    """What is kept whole is a basis: the mean over the loads does not choose what it can show."""
+    """The kept modes span their whole field: the mean over the loads does not limit them."""
     few = np.random.default_rng(3).standard_normal((2 * N_MODES, N_MODES))
     few[:, 3:] *= 1e-3
     modes = separate_blocks(fields, MASS, few, load_sizes(fields, MASS, few), 1e-9)
@@ -129,7 +129,7 @@ def test_blocks_of_points_are_compact_and_full() -> None:
 def test_a_step_shows_the_displacement_of_the_vademecum(
     phantom_vademecum: Vademecum, history: bool
 ) -> None:
-    """Of the patch under a tip, to a third of a per cent, with a fifth of its modes a point."""
+    """Displacement of the patch under a tip, to 0.3 %, with a fifth of its modes per point."""
     v, tip = phantom_vademecum, Tip("patch", 8e-3)
     effects = (SelfWeight(),) if history else ()
     data = prepare(v, (tip,), cloud="volume", effects=effects)

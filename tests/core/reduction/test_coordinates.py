@@ -1,4 +1,4 @@
-"""The ranges of coordinates: their ends are nodes, and nothing beyond is answered."""
+"""Ranges of coordinates: their ends are nodes, and values outside are refused."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Figure = Callable[[str], None]
 
 @pytest.mark.examples
 def test_ends_are_nodes_and_nothing_beyond_is_answered(figure: Figure) -> None:
-    """Any range: its ends answer with one node each; the next number outside is refused."""
+    """The ends of any range answer with one node each; the next number outside is refused."""
     seen = []
 
     @examples(100)
@@ -39,7 +39,7 @@ def test_ends_are_nodes_and_nothing_beyond_is_answered(figure: Figure) -> None:
         try:
             coordinate = Coordinate(name, low, high, n_nodes)
         except CoordinateError as refused:
-            assert high - low < 1e-14 * high or low == high, refused  # a range of nothing
+            assert high - low < 1e-14 * high or low == high, refused  # an empty range
             return
         seen.append(coordinate)
         for end, node in ((low, 0), (high, n_nodes - 1)):

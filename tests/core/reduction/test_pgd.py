@@ -1,4 +1,4 @@
-"""PGD over loads: exact recovery, optimality, honest reports; one sweep, no load, any rank."""
+"""PGD over loads: exact recovery, optimality, true reports; one sweep, no load, any rank."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Figure = Callable[[str], None]
 
 @pytest.fixture(scope="module")
 def block() -> Elasticity:
-    """Smaller than ``box_elasticity``, for many drawn problems."""
+    """Return a smaller problem than ``box_elasticity``, for many drawn problems."""
     mesh = cube(3)
     return Elasticity(mesh, Material(), regions_of(mesh).clamped)
 
@@ -31,7 +31,7 @@ def block() -> Elasticity:
 def problem_of_rank(
     elasticity: Elasticity, rank: int, n_loads: int = 30, decay: float = 0.5
 ) -> tuple[LoadProblem, np.ndarray]:
-    """Loads that are combinations of ``rank`` forces, and their exact solutions."""
+    """Return loads that combine ``rank`` forces, and their exact solutions."""
     rng = np.random.default_rng(rank)
     force = rng.standard_normal((3 * elasticity.n_nodes, rank))
     force.reshape(-1, 3, rank)[elasticity.clamped_nodes] = 0.0
@@ -75,7 +75,7 @@ def test_greedy_modes_are_near_the_svd_optimum(box_elasticity: Elasticity) -> No
 def test_stated_energy_error_is_the_true_one(
     box_elasticity: Elasticity, n_at_once: int, sweeps: int
 ) -> None:
-    """Also after one sweep, which is reported as cut short."""
+    """It is stated after one sweep too, which is reported as cut short."""
     problem, exact = problem_of_rank(box_elasticity, 12)
     solution = solve_pgd(problem, PGDRule(6, 0.0, block=n_at_once, max_sweeps=sweeps))
     left = exact - solution.space @ solution.load.T
@@ -108,7 +108,7 @@ def test_forces_on_the_clamp_alone_are_refused(block: Elasticity) -> None:
 
 @pytest.mark.examples
 def test_any_rank_over_loads_takes_as_many_modes(block: Elasticity, figure: Figure) -> None:
-    """Rank one, full rank and between, whatever number of pairs is sought at once."""
+    """Rank one, full rank and between, for any number of pairs at once."""
     worst = [0.0]
 
     @examples(25)
@@ -126,8 +126,8 @@ def test_any_rank_over_loads_takes_as_many_modes(block: Elasticity, figure: Figu
         gram = found.space.T @ block.apply(found.space)
         np.testing.assert_allclose(gram, np.eye(rank), atol=1e-10)
         worst.append(np.abs(found.space @ found.load.T - exact).max() / np.abs(exact).max())
-        assert worst[-1] < 1e-7  # what the bar of energy at rounding, 1e-13, allows
-        most = max(1, rank - 1)  # no block goes beyond what is allowed
+        assert worst[-1] < 1e-7  # the limit of the energy bar at rounding, 1e-13
+        most = max(1, rank - 1)  # no block exceeds the allowed number
         assert solve_pgd(problem, replace(rule, max_modes=most)).space.shape[1] == most
 
     check()

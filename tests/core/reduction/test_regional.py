@@ -1,4 +1,4 @@
-"""Fields separated region by region: least errors, told errors, one field across borders."""
+"""Fields separated region by region: least and stated errors, one field across borders."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from avatar_core.vademecum.model import Vademecum
 from tests.helpers.contact import prepare, step
 
 N_VERTICES, N_POSITIONS, N_LOADS = 40, 24, 3
-SINGLE = 5e-4  # squares of columns in single precision tell of errors above
+SINGLE = 5e-4  # squared columns in single precision resolve errors above this
 
 
 @pytest.fixture
 def columns() -> np.ndarray:
-    """Smooth fields of positions on a line: neighbours look alike, shape (3 n_v, n, 3)."""
+    """Return smooth fields of positions on a line: neighbours are similar, (3 n_v, n, 3)."""
     x = np.linspace(0.0, 1.0, 3 * N_VERTICES)[:, None, None]
     s = np.linspace(0.0, 1.0, N_POSITIONS)[None, :, None]
     direction = np.array([1.0, 0.3, -0.7])
@@ -71,7 +71,7 @@ def test_the_tolerance_is_met_with_as_few_modes_as_do(columns: np.ndarray) -> No
 
 
 def test_no_basis_of_as_many_modes_leaves_less(columns: np.ndarray) -> None:
-    """In the sense of the mean square of relative errors, against random and smooth bases."""
+    """By the mean square of relative errors, against random and smooth bases."""
     _, errors = separated(columns, RegionalRule(0.0, 0.0, 3))
     here = REGION == 1
     size = np.sqrt(np.einsum("x,xij->ij", MASS, columns**2))
@@ -96,7 +96,7 @@ def test_regions_are_compact_and_the_same_every_time() -> None:
 def test_displacement_and_force_cross_borders_of_regions_without_a_jump(
     phantom_vademecum: Vademecum,
 ) -> None:
-    """A tenth of a millimetre moves the cloud as little at a border as within a region."""
+    """A step of 0.1 mm moves the cloud as little at a border as within a region."""
     v, tip = phantom_vademecum, Tip("sphere", 8e-3)
     data = prepare(v, (tip,), cloud="volume")
     path = slide(v, tip.offset, 4e-3, 0.12)
@@ -119,7 +119,7 @@ def test_displacement_and_force_cross_borders_of_regions_without_a_jump(
 
 
 def test_a_history_in_many_regions_is_shown_without_a_jump(phantom_vademecum: Vademecum) -> None:
-    """Of soft tissue that was stroked across many regions, those that moved most stay shown."""
+    """Soft tissue was stroked across many regions: those that moved most stay shown."""
     v, tip = phantom_vademecum, Tip("sphere", 8e-3)
     slow = Viscoelasticity((0.95,), (2.0,))
     data = prepare(v, (tip,), cloud="volume", effects=(slow,))
@@ -141,7 +141,7 @@ def test_a_history_in_many_regions_is_shown_without_a_jump(phantom_vademecum: Va
 
 
 def test_regions_fade_before_they_are_left_out(phantom_vademecum: Vademecum) -> None:
-    """Of seven, four stay, each less what the fifth moves: whichever it is, nothing jumps."""
+    """Four of seven stay, each reduced by the fifth's motion, so that no change jumps."""
     data = prepare(phantom_vademecum, cloud="volume")
     state, start = data.state, data.model.arrays.region_start
     own = start[:7] + start[0]  # the first of its modes, after the global ones

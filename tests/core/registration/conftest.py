@@ -1,4 +1,4 @@
-"""A truth that several tests share."""
+"""True deformations that several tests share."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ from avatar_core.studies.registration_truth import Truth
 
 @pytest.fixture(scope="module")
 def truth(phantom_mesh: TetMesh) -> Truth:
-    """On another mesh than the vademecum's, 700 vertices for 900."""
+    """Deform another mesh than the vademecum's, 700 vertices for 900."""
     return Truth.on(phantom_mesh)

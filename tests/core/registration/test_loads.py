@@ -1,4 +1,4 @@
-"""Loads that a registration may find, what they displace, and where a few of them are sought."""
+"""Loads that a registration may find, their displacements, and candidates for few loads."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from avatar_core.registration.sites import Noise, find_sites
 from avatar_core.studies.registration_truth import Truth
 from avatar_core.vademecum.model import Vademecum
 
-pytestmark = pytest.mark.long  # for the organs that it builds
+pytestmark = pytest.mark.long  # it builds organs
 
 
 def everywhere(vademecum: Vademecum) -> np.ndarray:
@@ -117,7 +117,7 @@ def test_traction_is_correlated_over_the_length_that_is_asked_for(
 
 
 def test_the_only_support_takes_the_organ_with_it(phantom_vademecum: Vademecum) -> None:
-    """Whatever its stiffness; two supports that part strain it, and are found by their motion."""
+    """Its stiffness does not matter; two supports that part strain it, and show by their motion."""
     v, mesh = phantom_vademecum, phantom_vademecum.mesh
     faces = v.regions.clamped
     free = replace(v.regions, clamped=np.zeros_like(faces))
@@ -187,6 +187,6 @@ def test_two_places_are_found_among_many(phantom_vademecum: Vademecum) -> None:
     error = Noise(np.ones(len(data)), sp.identity(len(data), format="csr"), 1e-4, 1e-6)
     found = find_sites(np.zeros((len(data), 1)), columns, data, error)
     centres = v.surface.centers[places.positions]
-    assert len(found.chosen) <= 3  # two neighbours may stand for one
+    assert len(found.chosen) <= 3  # two neighbours may replace one
     for k in true:
         assert np.linalg.norm(centres[found.chosen] - centres[k], axis=1).min() < 0.02

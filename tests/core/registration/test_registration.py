@@ -1,4 +1,4 @@
-"""An organ registered to clouds whose truth is known, and clouds that are refused."""
+"""An organ registered to clouds with a known deformation, and refused clouds."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from avatar_core.vademecum.display import boundary, display_of
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds organs
 
 SETTINGS = RegistrationSettings(n_points=1500, peak=(0.012, 0.012))
 
@@ -90,7 +90,7 @@ def test_a_rigid_motion_and_its_derivatives() -> None:
 
 @pytest.mark.long
 def test_the_truth_is_in_equilibrium_at_large_deformation(truth: Truth) -> None:
-    """Small loads deform it as small strains do, large ones otherwise, moved supports too."""
+    """Small loads or support motions deform it as in linear elasticity, large ones do not."""
     for kind in ("pushes", "moved support"):
         for peak, low, high in ((1e-5, 0.0, 1e-3), (0.012, 0.01, 0.5)):
             settings = replace(SETTINGS, peak=(peak, peak))
@@ -120,7 +120,7 @@ def test_the_standard_deviation_grows_away_from_what_is_seen(
 
 
 def test_a_force_at_one_place_of_a_small_clamp_is_found(phantom: SurfaceMesh) -> None:
-    """An organ that swings by centimetres, of which a fifth is seen; smooth loads are of no use."""
+    """An organ swings by centimetres, a fifth of it is seen; smooth loads do not fit."""
     truth = Truth.on_small_clamp(tetrahedralize(phantom, 1400))
     vademecum = on_small_clamp(phantom, truth, 900)
     settings = RegistrationSettings(n_points=1500)
@@ -139,7 +139,7 @@ def test_a_force_at_one_place_of_a_small_clamp_is_found(phantom: SurfaceMesh) ->
 def test_what_the_cloud_does_not_decide_is_not_called_determined(
     phantom_vademecum: Vademecum, case: Case
 ) -> None:
-    """A few points at one end leave the other to the prior, whose width the interval has."""
+    """A few points at one end leave the other to the prior, with its interval."""
     points = case.cloud.points
     end = points[np.argsort(points[:, 0])[:600]]
     rule = RegistrationRule(kind="smooth", within=1e-3)
@@ -166,7 +166,7 @@ def test_background_is_left_out(phantom_vademecum: Vademecum, case: Case) -> Non
 def test_axes_are_suspected_only_if_a_rigid_motion_fits_them_better(
     phantom_vademecum: Vademecum, case: Case
 ) -> None:
-    """A deformed organ, too, may lie nearer to the points with x and y reversed."""
+    """A deformed organ may also lie nearer to the points with x and y reversed."""
     mesh = phantom_vademecum.mesh
     turned = Cloud(case.cloud.points * [-1.0, -1.0, 1.0])
     for fits, is_suspected in ((0.001, True), (0.02, False)):
@@ -186,7 +186,7 @@ def test_axes_are_suspected_only_if_a_rigid_motion_fits_them_better(
 def test_errors_that_neighbours_share_do_not_average_out(
     phantom_vademecum: Vademecum, case: Case
 ) -> None:
-    """1 mm over 30 mm, as of a stereo camera: of a shift, 1500 points say what 51 patches do."""
+    """1 mm over 30 mm, as in a stereo camera: 1500 points then determine a shift as 51 patches."""
     n, variance = len(case.cloud.points), []
     for length in (0.0, 0.03):
         rule = RegistrationRule(correlation=length)
@@ -198,7 +198,7 @@ def test_errors_that_neighbours_share_do_not_average_out(
 
 
 def test_the_noise_that_is_said_stands(phantom_vademecum: Vademecum, case: Case) -> None:
-    """A cloud without noise is no reason to believe small strains and meshes to a hundredth."""
+    """A cloud without noise does not justify trust in small strains and meshes to a hundredth."""
     mesh = phantom_vademecum.mesh
     still = Cloud(mesh.vertices[mesh.surface_vertices] + [0.004, 0.0, 0.0])
     for kind in ("smooth", "few"):
@@ -229,7 +229,7 @@ def test_what_no_load_explains_is_said(phantom_vademecum: Vademecum, case: Case)
 def test_a_deformation_beyond_small_strains_is_not_called_good(
     phantom_vademecum: Vademecum,
 ) -> None:
-    """The model fits it, as it is its own; no organ gives way like this."""
+    """The model fits a deformation of its own kind; no organ deforms like this."""
     v = phantom_vademecum
     basis, mesh = smooth_loads(v, np.ones(v.surface.n_positions, bool)), v.mesh
     coefficient = np.zeros(basis.size)
@@ -271,7 +271,7 @@ def test_targets_are_estimated_with_their_own_deviation(
 
 
 def display_ball(v: Vademecum) -> object:
-    """What is displayed with a small octahedron inside, named lesion."""
+    """Return the displayed surface with a small octahedron inside, named lesion."""
     centre = v.mesh.vertices.mean(axis=0)
     corner = centre + 8e-3 * np.vstack([np.eye(3), -np.eye(3)])
     faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
@@ -368,7 +368,7 @@ def test_columns_are_found_by_their_names(
 
 
 def test_points_that_say_nothing_new_are_left_out(tmp_path: Path, case: Case) -> None:
-    """Copies would be taken for so many measurements, and pixels without depth for the organ."""
+    """Copies would count as measurements, and pixels without depth as points of the organ."""
     points = case.cloud.points[::5]
     copies = np.tile(points, (5, 1)) + 1e-9 * np.random.default_rng(0).random((5 * len(points), 3))
     found = Cloud(copies)

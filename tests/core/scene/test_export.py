@@ -1,4 +1,4 @@
-"""What ParaView gets: the displacement that the vademecum gives, in a file that is whole."""
+"""Exports for ParaView: the displacement of the vademecum, in a complete file."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def file(straight: Vademecum, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(avatar: Command) -> Any:
-    """Runs ``avatar export ...``: exit code, output and errors."""
+    """Run ``avatar export ...``; return exit code, output and errors."""
     return partial(avatar, "export")
 
 
@@ -60,7 +60,7 @@ def test_the_file_holds_mesh_modes_and_displacement(
     np.testing.assert_array_equal(
         np.flatnonzero(held), np.unique(straight.mesh.boundary_faces[straight.regions.clamped])
     )
-    # the clamp does not move but by what truncated modes leave of it
+    # the clamp moves only by the error of truncated modes
     moved = np.linalg.norm(read.point_data["displacement [m]"], axis=1)
     assert moved[held].max() < 1e-3 * moved.max()
     assert file.read_bytes() == before
@@ -90,7 +90,7 @@ def test_a_tangential_force_is_added_linearly(bent: Vademecum) -> None:
 
 
 def test_compliance_between_two_points_is_reciprocal(straight: Vademecum) -> None:
-    """Maxwell and Betti: what a force here does there, a force there does here."""
+    """Maxwell and Betti: a force here displaces there as a force there does here."""
     here, there = straight.surface.centroids[[0, -1]]
     across = straight.compliance_at(here, there)
     np.testing.assert_allclose(across, straight.compliance_at(there, here).T, rtol=1e-5)
@@ -155,7 +155,7 @@ def test_point_and_force_are_written_alike(
 def test_a_surface_comes_back_to_its_place(
     run: Any, straight: Vademecum, tmp_path: Path, suffix: str, unit: str, axes: str
 ) -> None:
-    """As Slicer writes it: the header states the axes, which our reader honours."""
+    """As in Slicer, the header states the axes, which our reader honours."""
     centre = straight.mesh.vertices.mean(axis=0)
     corners = 8e-3 * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, -1, -1]], float)
     lesion = (centre + corners, np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]]))

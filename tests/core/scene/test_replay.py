@@ -1,4 +1,4 @@
-"""A recording replayed gives the same forces, where it can; where it cannot, it says so."""
+"""A replayed recording gives the same forces, or reports why it cannot."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.helpers.contact import prepare, solve
 
 RADIUS = 5e-3
 SPHERE = Tip("sphere", RADIUS)
-SAME = 1e-9  # [N], as promised; the difference is 0 in fact
+SAME = 1e-9  # promised tolerance [N]; the difference is 0 in fact
 VISCOUS = Viscoelasticity(g=(0.3,), tau=(0.1,))
 
 
@@ -38,7 +38,7 @@ def stored(vademecum: Vademecum, folder: Path) -> Vademecum:
 
 
 def recorded(vademecum: Vademecum, effects: Sequence[Effect], skipped: int = 0) -> Recording:
-    """What a loop would record: a push and a slide, with poses that fail; from a period on."""
+    """Record a push and a slide as a loop would, with failed poses; from a period on."""
     tips = push_and_slide(vademecum, RADIUS, 4e-3, 3e-3, 900, 40)[:, None].copy()
     tips[200:210] = np.nan
     tips[300:350] = FAR_AWAY
@@ -113,7 +113,7 @@ def test_a_start_in_contact_is_compared_from_the_first_free_period_on(organ: Vad
     force = made.periods.force[:, 0]
     assert force[0].any()
     found = replay(made, organ)
-    first = int(np.argmin(force.any(axis=1)))  # where the poses fail, the tip may be inside still
+    first = int(np.argmin(force.any(axis=1)))  # while poses fail, the tip may still be inside
     assert not found.known[: first + 1].any()
     assert found.known[-1] and found.difference(made) <= SAME
 
@@ -161,7 +161,7 @@ def test_a_scene_that_is_not_understood_is_refused(organ: Vademecum) -> None:
 
 
 def test_an_organ_that_hardly_moves_is_recorded(organ: Vademecum, tmp_path: Path) -> None:
-    """Two minutes of zeros take their space, so that the size that is claimed is the file's."""
+    """Two minutes of zeros take their space, so that the claimed size is the file's."""
     still = Clouds(np.arange(900), np.zeros((900, 300, 3), np.float32))
     save_recording(replace(recorded(organ, ()), clouds=still), tmp_path / "still.h5")
     assert load_recording(tmp_path / "still.h5").clouds.displacement.shape == (900, 300, 3)

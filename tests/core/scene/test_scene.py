@@ -1,4 +1,4 @@
-"""Scenes: what contradicts itself, what they ask of a vademecum, effects that combine."""
+"""Scenes: contradictions, requirements on a vademecum, combined effects."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from tests.helpers.scene_cases import PRONY, TWO
 
 
 def organ(**held: Any) -> Any:
-    """Stands for a vademecum: what ``Scene.require`` asks of one."""
+    """Return a stand-in for a vademecum, for ``Scene.require``."""
     nothing = dict.fromkeys(("parametric", "contrast", "large", "body"))
     return SimpleNamespace(**{**nothing, **held})
 
 
 def heavy_organ(**held: Any) -> Any:
-    """One that knows its mass."""
+    """Return an organ with a mass."""
     return organ(body=SimpleNamespace(), **held)
 
 
@@ -43,7 +43,7 @@ def organ_over(*coordinates: Coordinate) -> Any:
     return organ(parametric=SimpleNamespace(coordinates=coordinates))
 
 
-# --- what contradicts itself ----------------------------------------------------------------------
+# --- contradictions -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_an_effect_is_found_by_its_name_or_is_not_there() -> None:
     assert scene.effect("inertia") is None
 
 
-# --- what it asks of a vademecum ------------------------------------------------------------------
+# --- requirements on a vademecum ------------------------------------------------------------------
 
 
 def test_the_values_are_those_of_the_material() -> None:

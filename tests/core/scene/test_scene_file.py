@@ -1,4 +1,4 @@
-"""YAML of scenes: what it means, what is refused and what is written."""
+"""YAML of scenes: meaning, refusals and writing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tests.helpers.examples import examples
 from tests.helpers.scene_cases import PRONY, SHIPPED, refusal
 from tests.helpers.slowness import within
 
-# --- YAML: what it means --------------------------------------------------------------------------
+# --- YAML: meaning --------------------------------------------------------------------------------
 
 
 def test_every_key_arrives_where_it_belongs() -> None:
@@ -114,7 +114,7 @@ def test_words_that_yaml_takes_for_other_things_stay_words() -> None:
     assert (scene.name, scene.text, scene.vademecum) == ("no", "2024-01-01", "1e3")
 
 
-# --- YAML: what is refused ------------------------------------------------------------------------
+# --- YAML: refusals -------------------------------------------------------------------------------
 
 TIP = "tools:\n- name: a\n  tip: {{{}}}\n"
 FRICTION = "name: a\neffects:\n  friction:\n    static: {}\n"
@@ -187,7 +187,7 @@ FRICTION = "name: a\neffects:\n  friction:\n    static: {}\n"
         (TIP.format("shape: cone"), 3, ["tip: shape cone needs half_angle; give one"]),
         (TIP.format("shape: cone, angle: 60"), 3, ["tip.angle", "did you mean 'half_angle'?"]),
         ("tools:\n- name: a\n  tip: 5e-3\n", 3, ["tools[0].tip is 5e-3", "shape, radius"]),
-        # what contradicts itself
+        # contradictions
         (FRICTION.format("0.2"), 3, ["kinetic is 0.3, above static 0.2"]),
         ("name: a\ntools:\n- name: a\n- name: b\n", 2, ["2 tools without several_tools"]),
         ("tools:\n- name: a\n- name: b c\n", 3, ["'b c'", "topics"]),
@@ -204,7 +204,7 @@ FRICTION = "name: a\neffects:\n  friction:\n    static: {}\n"
         ("effects: [viscoelasticity: {g: [], tau: []}]", 1, ["0 g and 0 tau"]),
         ("effects: [viscoelasticity: {g: [0.6, 0.6], tau: [1, 2]}]", 1, ["the sum of g is 1.2"]),
         ("effects: [viscoelasticity: {file: p.csv}]", 1, ["this scene is no file"]),
-        # what YAML could do to whoever reads it
+        # attacks on the reader by YAML
         ("name: a\n<<: {text: b}\n", 2, ["<< is unknown"]),
         ("name: a\ntext: !!python/object/apply:os.getcwd []\n", 2, ["tag", "os.getcwd"]),
         ("name: a\ntext: !mine b\n", 2, ["the tag !mine"]),
@@ -222,7 +222,7 @@ def test_a_bad_file_is_one_line_with_place_key_and_remedy(
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_the_range_of_every_quantity_is_that_of_its_effect(name: str) -> None:
-    """A number beyond either end is refused with the range and the unit that the dataclass has."""
+    """A number beyond either end is refused with the range and the unit of the dataclass."""
     for field in fields(EFFECTS[name]):
         allowed = field.metadata["quantity"]
         for beyond in (allowed.low - 1.0, 2.0 * allowed.high + 1.0):
@@ -234,7 +234,7 @@ def test_the_range_of_every_quantity_is_that_of_its_effect(name: str) -> None:
 
 @pytest.fixture
 def closed_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No file can be opened."""
+    """Forbid opening files."""
 
     def opened(*_: Any) -> None:
         raise AssertionError("the file was opened")
@@ -254,7 +254,7 @@ def test_a_hundred_megabytes_are_refused_without_a_look(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("closed_files")
 def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe.yaml")  # to open it would be to wait for ever
+    os.mkfifo(tmp_path / "pipe.yaml")  # opening it would wait for ever
     with pytest.raises(SceneError, match=r"pipe\.yaml: is not a file"):
         read_scene(tmp_path / "pipe.yaml")
     with pytest.raises(SceneError, match="is not a file"):
@@ -307,7 +307,7 @@ def test_prony_terms_come_from_a_file_beside_the_scene(tmp_path: Path, table: st
     (tmp_path / "prony.csv").write_bytes(table.encode())
     scene = read_scene(prony_scene(tmp_path))
     assert scene.effects == (PRONY,)
-    assert parse_scene(write_scene(scene), "service") == scene  # which has no folder
+    assert parse_scene(write_scene(scene), "service") == scene  # without a folder
 
 
 @pytest.mark.parametrize(
@@ -332,7 +332,7 @@ def test_a_bad_table_is_one_line_with_both_places(tmp_path: Path, table: str, re
     with pytest.raises(SceneError) as caught:
         read_scene(prony_scene(tmp_path))
     assert reason in str(caught.value)
-    line = 3 if "7 g" in reason else 4  # of the effect, where the terms are good one by one
+    line = 3 if "7 g" in reason else 4  # line of the effect if each term alone is valid
     assert str(caught.value).startswith(f"{tmp_path}/scene.yaml:{line}: ")
     assert "\n" not in str(caught.value)
 
@@ -361,7 +361,7 @@ def test_terms_come_from_one_place(tmp_path: Path) -> None:
         read_scene(path)
 
 
-# --- What is written reads back -------------------------------------------------------------------
+# --- Written scenes read back ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -374,7 +374,7 @@ def test_a_shipped_scene_reads_and_writes(path: Path) -> None:
 def test_the_shipped_scenes_are_those_and_show_every_effect() -> None:
     scenes = {path.stem: read_scene(path) for path in SHIPPED}
     names = {stem: {effect.name for effect in scene.effects} for stem, scene in scenes.items()}
-    # without what excludes large deformation, and what needs another tip
+    # without effects that exclude large deformation or need another tip
     assert names["everything"] == set(EFFECTS) - {"tumour", "tilt", "grasp"}
     assert set().union(*names.values()) == set(EFFECTS)
     assert scenes["palpation"] == Scene(text=scenes["palpation"].text)
@@ -390,7 +390,7 @@ def test_numbers_of_numpy_are_written_as_numbers() -> None:
 
 
 def test_a_direction_becomes_a_unit_vector_once() -> None:
-    """What is one already does not change, not in its last digit either."""
+    """A unit vector does not change again, not even in its last digit."""
     effect = SelfWeight(direction=(1, 2, 3))
     np.testing.assert_allclose(effect.direction, np.array([1, 2, 3]) / np.sqrt(14), rtol=1e-15)
     assert SelfWeight(direction=effect.direction) == effect
@@ -398,7 +398,7 @@ def test_a_direction_becomes_a_unit_vector_once() -> None:
 
 
 def numbers_of(kind: type[Effect], key: str) -> st.SearchStrategy[Any]:
-    """Numbers in the range of a field; directions of any length, None where it is a default."""
+    """Draw numbers in the range of a field; directions of any length, or None as default."""
     (field,) = (f for f in fields(kind) if f.name == key)
     allowed = field.metadata["quantity"]
     number = st.floats(allowed.low, allowed.high)

@@ -16,17 +16,17 @@ from avatar_core.scene.model import Scene, SupportStiffness, Tool
 from tests.helpers.paths import ROOT
 
 PAGE = (ROOT / "msg_docs" / "interfaces" / "scene_file.md").read_text()
-WORDS = {"the vademecum's", "none", "all"}  # of a default that is None
+WORDS = {"the vademecum's", "none", "all"}  # words for a default that is None
 
 
 def rows() -> dict[str, tuple[str, str]]:
-    """Default and range with unit by key."""
+    """Return default and range with unit by key."""
     row = re.compile(r"^\| `(\S+)` \| (.*?) ?(?:\((\S+ to [^)]*)\) )?\|", re.MULTILINE)
     return {key: (default, span) for key, default, span in row.findall(PAGE)}
 
 
 def keys() -> Iterator[tuple[str, Field[Any] | None]]:
-    """All that a scene file may hold, by path."""
+    """Yield all that a scene file may hold, by path."""
     section = {name: group for group, names in SECTIONS.items() for name in names}
     for each in fields(Scene):
         if each.name not in ("tools", "effects"):

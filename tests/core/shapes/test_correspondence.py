@@ -1,4 +1,4 @@
-"""A template laid on other organs: it lies on them, unfolded, and carries what it should."""
+"""A template registered to other organs: it fits, stays unfolded, and carries data."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def sphere(radius: float) -> SurfaceMesh:
 
 
 def ring(radius: float = 0.085, thickness: float = 0.03, n: int = 48, m: int = 24) -> SurfaceMesh:
-    """A torus of 1.5 litres."""
+    """Return a torus of 1.5 litres."""
     around, across = np.meshgrid(np.arange(n), np.arange(m), indexing="ij")
     a, b = 2 * np.pi * around / n, 2 * np.pi * across / m
     far = radius + thickness * np.cos(b)
@@ -98,7 +98,7 @@ def distance_to(surface: SurfaceMesh, mesh: TetMesh) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def bent(box) -> tuple[Distortion, np.ndarray]:
-    """A box and positions that stretch, shear and compress its tetrahedra."""
+    """Return a box and positions that stretch, shear and compress its tetrahedra."""
     mesh, _ = box(2)
     x = mesh.vertices
     noise = 0.004 * np.random.default_rng(4).standard_normal(x.shape)
@@ -224,7 +224,7 @@ def test_a_shrunken_target_is_refused_with_the_unit_as_remedy(template):
 
 
 def test_what_does_not_converge_says_so(template, phantom, warped):
-    """A tolerance out of reach, and an alignment cut off after one step."""
+    """A tolerance out of reach, and an alignment stopped after one step."""
     target = replace(phantom, vertices=phantom.vertices @ WARP.T + SHIFT)
     found = register(template, target, RegistrationRule(tolerance=1e-6, n_stages=3))
     assert not found.converged and warped.converged and warped.notices == ()
@@ -247,7 +247,7 @@ def test_an_empty_surface_is_refused(template):
         register(template, flat)
 
 
-# --- what is carried --------------------------------------------------------------------------
+# --- carried data -----------------------------------------------------------------------------
 
 
 def test_regions_carried_to_the_registered_mesh_itself_are_the_template_s(warped):
@@ -258,7 +258,7 @@ def test_regions_carried_to_the_registered_mesh_itself_are_the_template_s(warped
 
 @pytest.fixture(scope="module")
 def patient(phantom: SurfaceMesh) -> TetMesh:
-    """The warped organ meshed anew, finer than the template."""
+    """Mesh the warped organ anew, finer than the template."""
     return tetrahedralize(replace(phantom, vertices=phantom.vertices @ WARP.T + SHIFT), 1000)
 
 
@@ -320,7 +320,7 @@ def test_interpolation_takes_the_closest_surface_point_outside(warped, patient):
     matrix = interpolation_matrix(warped.mesh, patient.vertices)
     assert matrix.sum(axis=1) == pytest.approx(1.0, abs=1e-12)
     assert matrix.min() >= -1e-9  # never extrapolates
-    found = matrix @ warped.mesh.vertices  # of the identity: the point itself or the closest one
+    found = matrix @ warped.mesh.vertices  # for the identity: the point itself or the closest one
     outline = SurfaceMesh(warped.mesh.vertices, warped.mesh.boundary_faces)
     expected = np.maximum(outline.skin.signed_distance(patient.vertices), 0.0)
     assert np.linalg.norm(found - patient.vertices, axis=1) == pytest.approx(expected, abs=1e-8)
@@ -356,7 +356,7 @@ def test_points_are_located_where_the_winding_number_says_inside(warped):
 
 
 def assert_fits(template: Template, surface: SurfaceMesh) -> None:
-    """On the surface in the mean, and near its thin tips: without reach 8 to 13 mm off."""
+    """Check the mean distance from the surface, and thin tips: without reach 8 to 13 mm off."""
     registration = register(template, surface)
     assert distance_to(surface, registration.mesh).mean() < 0.45e-3
     assert registration.mesh.tet_volumes.min() > 0

@@ -1,4 +1,4 @@
-"""Embedding, dimension and inner products of a base, against their mathematics and scikit-learn."""
+"""Embedding, dimension and inner products of a base, against mathematics and scikit-learn."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from avatar_core.shapes.lle import LLE, Gram, local_variances
 
 @pytest.fixture(scope="module")
 def flat() -> tuple[np.ndarray, np.ndarray]:
-    """Parameters (150, 4) and points (150, 80) of an affine family."""
+    """Draw parameters (150, 4) and points (150, 80) of an affine family."""
     rng = np.random.default_rng(1)
     t = rng.uniform(-1, 1, (150, 4))
     return t, t @ rng.standard_normal((4, 80)) + rng.standard_normal(80)
 
 
 def swiss_roll(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters (arc, height) and points of a rolled-up sheet in space."""
+    """Draw parameters (arc, height) and points of a rolled-up sheet in space."""
     rng = np.random.default_rng(0)
     t = 1.5 * np.pi * (1 + 2 * rng.random(n))
     height = 20 * rng.random(n)
@@ -25,7 +25,7 @@ def swiss_roll(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def explained(target: np.ndarray, coordinates: np.ndarray) -> float:
-    """Part of the variance of target that is an affine function of the coordinates."""
+    """Return the part of target's variance that is an affine function of the coordinates."""
     columns = np.c_[np.ones(len(coordinates)), coordinates]
     rest = target - columns @ np.linalg.lstsq(columns, target, rcond=None)[0]
     return float(1 - rest.var() / target.var())
@@ -95,7 +95,7 @@ def test_local_variances_find_a_curved_sheet_and_full_noise():
     assert rolled.dimension().from_local_pca == 2
     rng = np.random.default_rng(6)
     noise = LLE(12).fit(rng.standard_normal((200, 40))).dimension()
-    assert noise.gap < 3  # nothing stands out
+    assert noise.gap < 3  # no gap stands out
     assert noise.notices[0].startswith("no clear gap")
     assert noise.from_local_pca >= 10
 

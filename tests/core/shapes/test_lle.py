@@ -1,13 +1,13 @@
-"""Weights and growth of a base against their mathematics and scikit-learn.
+"""Weights and growth of a base against mathematics and scikit-learn.
 
-Also of bases that leave the weights undecided: equal, nearly equal, in line, few, far away.
+Bases that leave the weights undecided are tested too: equal, nearly equal, in line, few, far away.
 With C the local Gram matrix of k neighbours, r the regularisation and d the least distance, the
 weights minimise w.Cw + r tr(C) |w|^2 among all that sum to one. Compared with the nearest neighbour
-alone, w = e_1, that says
+alone, w = e_1, this gives
 
     |w|^2 <= 1 + d^2 / (r tr(C)) <= 1 + 1 / (r k),     w.Cw <= d^2 + r tr(C),
 
-whatever the neighbours are; compared with an exact representation, x = sum_j v_j X_j,
+for any neighbours. Compared with an exact representation, x = sum_j v_j X_j, it gives
 
     |w| <= |v|,     w.Cw <= r tr(C) |v|^2,     where w.Cw = |x - sum_j w_j X_j|^2.
 """
@@ -34,15 +34,15 @@ from avatar_core.shapes.barycenter import (
 from avatar_core.shapes.lle import LLE, Gram
 from tests.helpers.examples import examples
 
-NONE = 1e-12  # a regularisation that is almost none
+NONE = 1e-12  # nearly no regularisation
 EPS = float(np.finfo(float).eps)
 NEAR = 1e-5  # a hundredth of a millimetre [m]
-TRUSTED = 5e-11  # what rounding may do to the weights of a base, `avatar_core.shapes.lle`
+TRUSTED = 5e-11  # bound of rounding on the weights of a base, `avatar_core.shapes.lle`
 
 
 @pytest.fixture(scope="module")
 def livers() -> np.ndarray:
-    """Signed distances of 12 livers of two kinds of change at some 5,000 points, (12, D) [m]."""
+    """Return signed distances of 12 livers of two kinds at some 5,000 points, (12, D) [m]."""
     phantom = phantom_liver(12e-3)
     organs = [shape.moved(phantom) for shape in population(12, seed=3, bend=5e-3)]
     box = padded_box(organs, 14e-3, 20e-3)
@@ -85,7 +85,7 @@ def test_weights_equal_those_of_scikit_learn(cloud, k, regularization):
     reference = pytest.importorskip("sklearn.manifold._locally_linear")
     theirs = reference.barycenter_kneighbors_graph(cloud, k, reg=regularization).toarray()
     ours = LLE(k, regularization=regularization).fit(cloud).weight_matrix
-    assert np.abs(ours - theirs).max() < 1e-8  # the agreement asked for
+    assert np.abs(ours - theirs).max() < 1e-8  # the required agreement
 
 
 def test_a_base_far_from_zero_keeps_its_digits(cloud):
@@ -144,14 +144,14 @@ def test_convex_weights_equal_a_general_optimiser(cloud):
     assert np.allclose(ours, found.x, atol=1e-4)  # where the general optimiser stops
 
 
-# --- members and equals -----------------------------------------------------------------------
+# --- members and duplicates -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("k", [1, 2, 10, 60])
 @pytest.mark.parametrize("convex", [False, True])
 def test_member_has_weight_one_on_itself(cloud, k, convex):
     values = [row.astype(np.float32) / 3 for row in cloud]
-    values[30][0] = np.nan  # a member that failed spoils no other
+    values[30][0] = np.nan  # a failed member affects no other
     for i in (0, 17, 59):
         found = barycenter(cloud, cloud[i], k, convex=convex, regularization=1e-3)
         assert (found.member, found.neighbors[0], found.weights[0]) == (i, i, 1.0)
@@ -227,7 +227,7 @@ def test_bad_requests_name_cause_and_remedy(cloud, call, words):
 
 
 def with_one_more(base: LLE, point: np.ndarray) -> LLE:
-    """As an atlas grows: one more row of inner products, about the same origin."""
+    """Grow a base as an atlas does: one more row of inner products, about the same origin."""
     return LLE(base.n_neighbors, regularization=base.regularization).fit(
         (*base.vectors_, point), gram=base.gram_.grown(base.vectors_, point)
     )
@@ -247,7 +247,7 @@ def test_base_grown_one_by_one_equals_the_batch(cloud, start, k, regularization)
     one_by_one = grown(cloud, start, k, regularization=regularization)
     batch = LLE(k, regularization=regularization).fit(cloud)
     assert np.array_equal(one_by_one.neighbors_, batch.neighbors_)
-    assert np.abs(one_by_one.weights_ - batch.weights_).max() < 1e-10  # the agreement asked for
+    assert np.abs(one_by_one.weights_ - batch.weights_).max() < 1e-10  # the required agreement
     a, b = (np.linalg.qr(base.embedding_)[0] for base in (one_by_one, batch))
     # singular values 1: the same subspace, so the same map up to sign and rotation
     assert np.linalg.svd(a.T @ b, compute_uv=False).min() > 1 - 1e-6
@@ -264,7 +264,7 @@ def test_base_with_equals_grows_like_the_batch(cloud):
 
 
 def sound(found: Barycenter, base: np.ndarray, x: np.ndarray, r: float) -> None:
-    """Weights that are weights, bounded as they must be, and a residual that is theirs."""
+    """Check that weights sum to one and are bounded, and that the residual is theirs."""
     w, k = found.weights, len(found.weights)
     assert np.isfinite(w).all()
     assert abs(w.sum() - 1.0) <= 2.0 * k * EPS * found.absolute_sum
@@ -276,7 +276,7 @@ def sound(found: Barycenter, base: np.ndarray, x: np.ndarray, r: float) -> None:
 
 
 def rows_are_sound(base: LLE, r: float) -> None:
-    """The same of the weights of every member that has neighbours."""
+    """Check the weights of every member that has neighbours as :func:`sound` does."""
     has = len(base.vectors_) - len(base.repeated) > 1
     assert np.isfinite(base.weights_).all()
     sums = base.weight_matrix.sum(axis=1)
@@ -295,7 +295,7 @@ KINDS = ("scattered", "equal", "near", "in line", "two clusters", "one far away"
 
 
 def base_of(kind: str, n: int, length: int, seed: int) -> np.ndarray:
-    """n vectors of a size of 0.1, as different as the kind allows."""
+    """Draw n vectors of a size of 0.1, as different as the kind allows."""
     rng = np.random.default_rng(seed)
     base = rng.standard_normal((n, length))
     if kind == "equal":
@@ -329,7 +329,7 @@ def base_of(kind: str, n: int, length: int, seed: int) -> np.ndarray:
 def test_any_base_gives_bounded_weights_that_sum_to_one(
     kind: str, n: int, k: int, length: int, r: float, seed: int, single: bool
 ) -> None:
-    """Fitted, grown or asked for a new point; n = 1, k = 1, k = n, k > n, any regularisation."""
+    """Fitted, grown or queried for a new point; n = 1, k = 1, k = n, k > n, any regularisation."""
     base = base_of(kind, n, length, seed)
     rng = np.random.default_rng(seed + 1)
     if single:
@@ -375,7 +375,7 @@ def test_any_base_gives_bounded_weights_that_sum_to_one(
 
 
 def test_near_duplicates_of_a_hundredth_of_a_millimetre(livers: np.ndarray) -> None:
-    """They share a weight; no shape made of them moves by more than they differ."""
+    """Their weights are divided; no shape made of them moves by more than they differ."""
     rng = np.random.default_rng(1)
     again = livers[:6] + NEAR * rng.uniform(-1.0, 1.0, (6, livers.shape[1]))
     both = np.vstack([livers, again])
@@ -383,7 +383,7 @@ def test_near_duplicates_of_a_hundredth_of_a_millimetre(livers: np.ndarray) -> N
     assert base.repeated == ()
     rows_are_sound(base, DEFAULT_REGULARIZATION)
     rms = NEAR / np.sqrt(3.0)
-    for i in range(6):  # each is written by its twin, to the distance between the two
+    for i in range(6):  # each is represented by its twin, to the distance between the two
         twin = base.weight_matrix[i, 12 + i]
         assert twin == pytest.approx(1.0, abs=0.01)
         left = np.linalg.norm(livers[i] - base.weight_matrix[i] @ both)
@@ -433,7 +433,7 @@ def test_all_neighbours_and_more(livers: np.ndarray, k: int) -> None:
 
 
 def test_a_gram_matrix_without_trace() -> None:
-    """Neighbours that all are the point, up to what numbers can hold: equal shares."""
+    """All neighbours equal the point, up to floating-point range: equal weights."""
     for scale in (0.0, 5e-324, 1e-310, 1e-200):
         gram = scale * np.ones((4, 4))
         for r in (1e-12, 1e-6, 1.0):
@@ -455,7 +455,7 @@ def test_a_gram_matrix_without_trace() -> None:
     ("kind", "shift"), [(np.float64, 0.0), (np.float64, 64.0), (np.float32, 0.0)]
 )
 def test_a_query_equal_to_a_member(livers: np.ndarray, kind: type, shift: float) -> None:
-    """Each one is known again, and no neighbour is taken for it, wherever the zero is."""
+    """Each member is recognised, and no neighbour is mistaken for it, whatever the origin."""
     base = LLE(8).fit(livers + shift)
     for i in range(len(livers)):
         found = base.barycenter((livers[i] + shift).astype(kind))
@@ -470,7 +470,7 @@ def test_a_query_equal_to_a_member(livers: np.ndarray, kind: type, shift: float)
 
 @pytest.mark.parametrize("convex", [False, True])
 def test_translation_and_order_change_nothing(livers: np.ndarray, convex: bool) -> None:
-    """Bit for bit, where the differences of the vectors are exact: on a grid of 2^-40 m."""
+    """Bit for bit, if the differences of the vectors are exact: on a grid of 2^-40 m."""
     exact = np.round(livers * 2.0**40) / 2.0**40
     x = np.round(exact[:4].mean(axis=0) * 2.0**40) / 2.0**40
     shift = np.round(np.random.default_rng(0).uniform(-8.0, 8.0, exact.shape[1]) * 2.0**8) / 2.0**8

@@ -1,4 +1,4 @@
-"""A population of organs: its maps, and what locally linear embedding sees of it."""
+"""A population of organs: its maps, and its locally linear embedding."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.core.shapes.test_embedding import explained
 
 @pytest.fixture(scope="module")
 def in_silico(phantom) -> tuple[list[ShapeMap], list[DistanceGrid]]:
-    """50 organs of Eq. 17 on one grid of about the paper's relation of spacing to size."""
+    """Return 50 organs of Eq. 17 on one grid, with about the paper's relative spacing."""
     maps = population(50, seed=0)
     organs = [shape.moved(phantom) for shape in maps]
     box = padded_box(organs, 12e-3, 18e-3)
@@ -32,7 +32,7 @@ def test_held_out_organs_are_interpolated(in_silico):
         guess = DistanceGrid(
             grid.origin, grid.spacing, found.combine(vectors).reshape(grid.values.shape)
         )
-        # asked for: 0.5 % in the mean of the five (paper: below 5 %); here each of them
+        # required: a mean of 0.5 % over the five (paper: below 5 %); here each of them
         assert guess.volume == pytest.approx(grid.volume, rel=0.01)
 
 

@@ -1,4 +1,4 @@
-"""What ``avatar bench effects`` times: steps in which a tip is felt."""
+"""Steps that ``avatar bench effects`` times: each has a force on the tip."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.helpers.contact import prepare, step
 
 @pytest.mark.long
 def test_a_leaning_punch_is_felt_all_along_its_path() -> None:
-    """A flat face that is found too deep counts as set there, and is not felt."""
+    """A flat face that starts too deep counts as set there, without a force."""
     cube = organ("cube")
     (effects,) = [effects for _, _, effects in cases_on(cube) if find(effects, Tilt)]
     data = prepare(cube, (PUNCH,), effects=effects)
@@ -26,4 +26,4 @@ def test_a_leaning_punch_is_felt_all_along_its_path() -> None:
         step(data, tips, np.array([[0.0, 0.0, 0.0, 1.0]]))
         felt.append((np.linalg.norm(data.out.force[0]), np.linalg.norm(data.out.torque[0])))
     assert np.min(felt, axis=0)[0] > 1.0  # N
-    assert np.min(felt, axis=0)[1] > 1e-3  # Nm, that rights it
+    assert np.min(felt, axis=0)[1] > 1e-3  # Nm, righting torque

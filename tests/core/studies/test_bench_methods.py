@@ -1,4 +1,4 @@
-"""The rivals of the step: they feel and show what it does, or nobody need ask how fast."""
+"""Rival methods of the step: same forces and displacements, or their speed is meaningless."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from avatar_core.studies.bench import methods
 from avatar_core.studies.bench.methods import SPHERE, Kind, tool_paths
 from avatar_core.vademecum.model import Vademecum
 
-APART = 5e-3  # by smoothing and blocks, which the tables do not have
+APART = 5e-3  # difference by smoothing and blocks, which the tables do not have
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.int16])

@@ -1,4 +1,4 @@
-"""The study of certainty: its parts, without a build of an organ."""
+"""The study of certainty: its parts, without building an organ."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_registrations_are_summed_up_over_all_and_by_what_deformed_the_organ() -
     assert found["registration_worst"] == pytest.approx(0.4)
     assert found["registration_error_turned_weight"] == pytest.approx(0.4)
     assert found["registration_seconds"] == 4.0
-    assert all(key.startswith("registration_") for key in found)  # of its section
+    assert all(key.startswith("registration_") for key in found)  # keys of its section
     axes = Figure().subplots()
     draw_errors(axes, rows)
     heights = [bar.get_height() for bar in axes.containers[0]]

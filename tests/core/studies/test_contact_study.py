@@ -1,4 +1,4 @@
-"""The study of contacts: its key figures from contacts that are known."""
+"""The study of contacts: key figures from known contacts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SITE = Site("drawn", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0)
 
 
 def contact(force: float, estimate: float, angle: float = 0.0) -> SiteContact:
-    """A contact whose resolved force is 2 N."""
+    """Return a contact with a resolved force of 2 N."""
     return SiteContact(
         SITE, Tip("sphere", 3e-3), 1e-3, 2.0, force, angle, estimate, 0.5 * estimate, 6.0, 1.0, 0.05
     )
@@ -25,7 +25,7 @@ def test_key_figures_are_those_of_the_contacts() -> None:
     )
     assert found["force_mean"] == pytest.approx((0.05 + 0.1) / 4)
     assert found["force_worst"] == pytest.approx(0.1)
-    assert found["coverage"] == 0.75  # 1.8 N is 0.2 N off and says 0.1 N
+    assert found["coverage"] == 0.75  # 1.8 N is 0.2 N off, with an estimate of 0.1 N
     assert found["patch_mean"] == pytest.approx(2.0)
     assert found["hertz_mean"] == pytest.approx(0.5)
     assert found["far_field_l2"] == found["far_field_l2_median"] == 0.05

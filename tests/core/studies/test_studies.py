@@ -1,4 +1,4 @@
-"""Studies: tiny forms on phantoms, against what is known exactly, and what they write."""
+"""Studies: tiny forms on phantoms, against exact results, and their files."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
 
 @pytest.fixture
 def conduct(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Conduct:
-    """Conducts a study where there is no default folder of livers, and looks at its files.
+    """Conduct a study without a default folder of livers; return its results and files.
 
-    The summary of the run is then that of its JSON.
+    The summary of the run then equals that of its JSON.
     """
     monkeypatch.chdir(tmp_path)
 
@@ -132,7 +132,7 @@ def test_an_interrupted_study_leaves_its_rows_and_goes_on(
     count = json.loads(line)["n_vertices"]
     assert count > 100
     line = line.replace(str(count), "12345")
-    path.write_text(line + "\n" + line[:40])  # the process died as it wrote the second row
+    path.write_text(line + "\n" + line[:40])  # the process died while writing the second row
     found = meshes.STUDY.conduct(settings, tmp_path, livers)
     assert [row["liver"] for row in found.rows] == ["LiTS-5", "LiTS-6", "LiTS-7"]
     assert found.rows[0]["n_vertices"] == 12345  # it was not measured again
@@ -186,7 +186,7 @@ def test_samples(conduct: Conduct) -> None:
 def test_pgd(conduct: Conduct, tmp_path: Path) -> None:
     run = conduct(pgd.STUDY, pgd.PGDSettings(300, 24), write_phantoms(tmp_path, 1))
     summary = run.summary
-    # no modes are better than the best; the default is exact near the patch
+    # no modes beat the best; the default is exact near the patch
     assert summary["svd_l2_mean_11_modes"] < summary["l2_mean_11_modes"] < 1.0
     assert summary["default_l2_mean_11_modes"] < summary["l2_mean_11_modes"]
 
@@ -255,7 +255,7 @@ def test_accuracy_time(conduct: Conduct) -> None:
     assert summary["promise_kept_fraction"] >= 0.95
     assert summary["budget_kept_least"] >= 0.93
     assert summary["force_error_coverage"] >= 0.85  # 150 contacts: 90 % less two deviations
-    # it tells touches apart: one error for all of them would have to be larger in most places
+    # it distinguishes touches: one error for all would have to be larger in most places
     assert summary["force_error_overestimate"] <= 0.8 * summary["one_error_overestimate"]
     assert summary["front_points"] >= 5
     methods = {row["method"] for row in run.rows}
@@ -267,7 +267,7 @@ def test_accuracy_time(conduct: Conduct) -> None:
 
 @pytest.mark.long
 def test_moved_organs_are_laid_on_the_phantom() -> None:
-    """One that is larger and stands on its side, and one that is tilted."""
+    """One organ is larger and stands on its side, the other is tilted."""
     organ = phantom_liver(12e-3)
     side, tilt = (Rotation.from_euler("z", a, degrees=True).as_matrix() for a in (90.0, 5.0))
     larger = replace(organ, vertices=1.2 * organ.vertices @ side.T + 0.05)

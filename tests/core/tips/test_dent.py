@@ -1,4 +1,4 @@
-"""The dent that is shown near a tip, against Boussinesq's, Sneddon's and resolved displacements."""
+"""The displayed dent near a tip, against Boussinesq's, Sneddon's and resolved displacements."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_a_tip_shows_its_own_dent_for_the_patchs(tip: Tip, depth: float) -> None
 
 
 def test_the_change_ends_without_a_step_or_a_kink() -> None:
-    """A wide punch, of whose dent most is left there."""
+    """A wide punch, most of whose dent remains there."""
     tip, rho = Tip("flat", 10e-3), np.linspace(0.70 * END, END + 1e-3, 80)
     points = rho[:, None] * np.array([[1.0, 0.0, 0.0]])
     data = flat_organ(tip=tip, points=points)
@@ -101,7 +101,7 @@ def test_a_patch_shows_what_it_did() -> None:
 
 
 def test_a_dent_in_relaxing_tissue_keeps_its_shape() -> None:
-    """Its load relaxes, and the elastic load that dents alike does not."""
+    """Its load relaxes, but not the elastic load with the same dent."""
     points = ALONG[:, None] * np.array([[1.0, 0.0, 0.0]])
     soft = flat_organ((Viscoelasticity((0.6,), (0.02,)),), tip=SPHERE, points=points)
     elastic = flat_organ(tip=SPHERE, points=points)
@@ -116,8 +116,10 @@ def test_a_dent_in_relaxing_tissue_keeps_its_shape() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(("times", "limit"), [(0, 0.02e-3), (2, 0.03e-3)])
 def test_a_cube_shows_sneddons_dent(times: int, limit: float) -> None:
-    """Along the normal, within two patch radii of a tip; at the vertices of a coarse mesh, and
-    between them where a finer surface is displayed."""
+    """Along the normal, within two patch radii of a tip.
+
+    At the vertices of a coarse mesh, and between them if a finer surface is displayed.
+    """
     data = prepare(finer(organ("cube"), times) if times else organ("cube"), (SPHERE,), effects=())
     patch, rest = with_patch_dents(data), data.model.arrays.rest[:, :3].astype(float)
     errors = []
@@ -142,7 +144,7 @@ def test_a_cube_shows_sneddons_dent(times: int, limit: float) -> None:
 
 @pytest.mark.long
 def test_the_changes_of_several_tips_add_up() -> None:
-    """Each is that of the tip by itself, pressed until it bears the same force."""
+    """Each change equals that of the tip alone, pressed to the same force."""
     tips = (SPHERE, Tip("sphere", 5e-3))
     data = prepare(organ("cube"), tips, effects=(SeveralTools(),))
     places = top("cube") + np.array([[1e-3, 0.0, 1e-3], [12e-3, 0.0, -1e-3]])
@@ -166,7 +168,7 @@ def missing_force(
 def dent_change(
     data: ContactData, tips: Sequence[Tip], places: np.ndarray, depth: float
 ) -> np.ndarray:
-    """What tips show beside patches of their force, shape (n, 3) [m]."""
+    """Return the displacement of tips minus that of patches with their force, shape (n, 3) [m]."""
     up = np.tile(UP, (len(tips), 1))
     patch = displaced(with_patch_dents(data), tips, places, up, depth)
     return displaced(data, tips, places, up, depth) - patch

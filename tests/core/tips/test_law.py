@@ -16,12 +16,12 @@ from tests.helpers.flat_organ import COMPLIANCE, E_STAR, PATCH_RADIUS, flat_orga
 from tests.helpers.half_space import on_soft_base, sneddon
 
 SPHERE, CONE = Tip("sphere", 5e-3), Tip("cone", 15e-3, 60.0)
-DENT = PATCH / (E_STAR * PATCH_RADIUS)  # compliance of an organ that has but that of the dent
-BASE = COMPLIANCE - DENT  # of the organ beside the dent [m/N]
+DENT = PATCH / (E_STAR * PATCH_RADIUS)  # compliance of an organ that has only that of the dent
+BASE = COMPLIANCE - DENT  # compliance of the organ beside the dent [m/N]
 
 
 def force_after_touch(data: ContactData, depth: float) -> float:
-    """The tip's centre may be below the surface, after a touch [N]."""
+    """Return the force; the tip's centre may be below the surface, after a touch [N]."""
     force_at_depth(data, 1e-4)
     return force_at_depth(data, depth)
 
@@ -49,7 +49,7 @@ ELEMENTS = {
 def test_a_sphere_in_a_neo_hookean_half_space_is_that_of_finite_elements(
     nu: float, radius: float, base: float
 ) -> None:
-    """Where the organ gives way besides, too."""
+    """The organ may also give way as a whole."""
     data = flat_organ(compliance=DENT + base, tip=Tip("sphere", radius), neo_hookean=nu)
     for depth, force in ELEMENTS[nu].items():
         expected = force * (1.0 - nu**2) * E_STAR * radius**2

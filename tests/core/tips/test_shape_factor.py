@@ -1,4 +1,4 @@
-"""What a tip feels of bulges, facets, folds and edges, beside the law of a plane."""
+"""Effect of bulges, facets, folds and edges on a tip, relative to the law of a plane."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ BALLS = [Tip("sphere", radius) for radius in RADII]
 
 @cache
 def roof() -> TipField:
-    """Of a block whose top falls off to both sides of the ridge x = 0.05, y = ``TOP``."""
+    """Return a block whose top falls off to both sides of the ridge x = 0.05, y = ``TOP``."""
     box = box_mesh(4, (0.1, TOP, 0.1))
     vertices = box.vertices.copy()
     vertices[:, 1] -= SLOPE * abs(vertices[:, 0] - 0.05) * vertices[:, 1] / TOP
@@ -43,7 +43,7 @@ def roof() -> TipField:
 
 @cache
 def round_organ() -> TipField:
-    """A ball, accessible all around."""
+    """Return a ball, accessible all around."""
     surface = ball(BALL, level=5)
     apex = np.full((len(surface.faces), 1), len(surface.vertices))
     mesh = TetMesh(
@@ -65,7 +65,7 @@ def shape_factor(field: TipField, tip: Tip, at: np.ndarray) -> np.ndarray:
 
 
 def over_the_ridge(tip: Tip, depths: np.ndarray) -> np.ndarray:
-    """Poses of a tip above the middle of the ridge."""
+    """Return poses of a tip above the middle of the ridge."""
     at = np.tile([0.05, TOP + tip.offset, 0.047], (len(depths), 1))
     at[:, 1] -= depths
     return at
@@ -105,7 +105,7 @@ def test_on_a_ball_a_ball_is_hertzs(radius: float, depth: float) -> None:
 
 @pytest.mark.parametrize("tip", BALLS)
 def test_over_one_curvature_the_depth_changes_little(tip: Tip) -> None:
-    """So that the force on the tool is the load on the organ."""
+    """The force on the tool is therefore the load on the organ."""
     deep, shallow = (
         shape_factor(round_organ(), tip, over_the_ball(tip, depth)) for depth in (4e-3, 1e-3)
     )
@@ -147,12 +147,12 @@ def test_a_patch_and_a_field_without_an_outline_have_none() -> None:
     assert factors_of(roof(), [Tip("patch", 3e-3)]).value.size == 0
 
 
-# --- what is kept -----------------------------------------------------------------------------
+# --- cache ------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Tip]]:
-    """The tips of which factors were computed since, in a cache that is empty."""
+    """Record the tips whose factors are computed, with an empty cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     found: list[Tip] = []
 
@@ -170,7 +170,7 @@ def test_a_factor_is_computed_once_for_an_organ_and_a_tip(made: list[Tip]) -> No
     tips = [Tip("sphere", 3e-3), PUNCH]
     for _ in range(2):
         factors_of(roof(), tips)
-        kept_factors._kept.cache_clear()  # as another process
+        kept_factors._kept.cache_clear()  # as in another process
     assert made == tips
     moved = roof()._replace(distance=roof().distance + np.float32(1e-3))
     factors_of(moved, tips[:1])

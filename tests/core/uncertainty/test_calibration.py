@@ -1,4 +1,4 @@
-"""Calibration: a posterior in closed form, truths found again, and a wrong model that shows."""
+"""Calibration: a posterior in closed form, recovered true values, and a wrong model that shows."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from tests.core.conftest import Command
 from tests.helpers.soft_organ import organ_on_springs, soft_organ
 from tests.helpers.touches import SPHERE, felt, path_over, recording_of
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds organs
 
 N_TOUCHES = 8
 TRUE = {"young": 6e3, "poisson": 0.45, "contrast": 5.0}
@@ -67,19 +67,19 @@ def table(organ: Vademecum, tips: np.ndarray, forces: np.ndarray) -> TouchTable:
 
 
 def with_forces(table: TouchTable, log_force: np.ndarray) -> TouchTable:
-    """As if these had been measured."""
+    """Replace the measured forces."""
     force = table.palpation.force.copy()
     force[table.palpation.sampled] = np.exp(log_force)
     return replace(table, palpation=replace(table.palpation, force=force))
 
 
 def without_error(table: TouchTable) -> TouchTable:
-    """As if the vademecum's forces were exact."""
+    """Drop the vademecum's errors, as if its forces were exact."""
     return replace(table, error=np.zeros(len(table.error)))
 
 
 def at(table: TouchTable, **values: float) -> np.ndarray:
-    """ln of the forces at values."""
+    """Return ln of the forces at values."""
     return table.at({name: np.array([value]) for name, value in (TRUE | values).items()})[0]
 
 
@@ -137,7 +137,7 @@ def test_touches_off_the_organ_are_counted_or_refused(
 
 
 def test_young_alone_has_a_posterior_in_closed_form(table: TouchTable) -> None:
-    """ln E is normal before, and so is ln F: the mean of two normal distributions."""
+    """ln E is normal a priori, and so is ln F: the mean of two normal distributions."""
     factor, n = 1.5, len(table.measured)
     prior = Lognormal(4e3, factor)
     known = {"young": prior, "poisson": Fixed(0.45), "contrast": Fixed(5.0)}
@@ -153,7 +153,7 @@ def test_young_alone_has_a_posterior_in_closed_form(table: TouchTable) -> None:
 
 
 def test_all_values_are_found_again(organ: Vademecum, table: TouchTable) -> None:
-    """The forces of the vademecum itself, at values between the points of the table."""
+    """The forces are the vademecum's own, at values between the points of the table."""
     found = calibrated(without_error(table), priors_of(organ), SENSOR_ALONE)
     for name, value in TRUE.items():
         low, high = found.interval(name)
@@ -163,9 +163,9 @@ def test_all_values_are_found_again(organ: Vademecum, table: TouchTable) -> None
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say(table: TouchTable) -> None:
-    """Errors drawn from C itself; a right model is rarely called wrong."""
+    """Errors are drawn from C itself; a right model is rarely called wrong."""
     known = {"young": Lognormal(5e3, 1.5), "poisson": Fixed(0.45), "contrast": LogUniform(1, 9.9)}
-    errors, rng = TouchErrors(extent=0.0), np.random.default_rng(2)  # which is not in C
+    errors, rng = TouchErrors(extent=0.0), np.random.default_rng(2)  # not in C
     held, chances = [], []
     for _ in range(60):
         true = {name: float(one.ppf(rng.random())) for name, one in known.items()}
@@ -184,7 +184,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(table: TouchTable) -> Non
 def test_the_extent_of_a_tumour_is_known_no_better_than_its_mesh(
     organ: Vademecum, table: TouchTable
 ) -> None:
-    """However exact the forces: ln of the contrast has at least that deviation, others do not."""
+    """For any exact forces, ln of the contrast has at least that deviation; others do not."""
     exact = without_error(table)
     known = priors_of(organ)
     alone = calibrated(exact, known, SENSOR_ALONE)
@@ -211,7 +211,7 @@ def test_larger_errors_widen_the_interval_of_young(organ: Vademecum, table: Touc
 
 
 def test_a_model_without_the_tumour_is_found_out(organ: Vademecum, table: TouchTable) -> None:
-    """Not by what all forces share, but by the difference of places."""
+    """The difference of places shows it, not the common part of all forces."""
     hard = with_forces(without_error(table), at(table, contrast=10.0))
     known = priors_of(organ, {"contrast": Fixed(0.5)})
     found = calibrated(hard, known, SENSOR_ALONE)
@@ -270,7 +270,7 @@ def run(
     tips: np.ndarray,
     forces: np.ndarray,
 ) -> Command:
-    """Runs ``avatar calibrate liver.h5 --recording ...``: exit code, output and errors."""
+    """Run ``avatar calibrate liver.h5 --recording ...``; return exit code, output and errors."""
     monkeypatch.setattr(material_grid, "N_POINTS", 3)
     os.link(liver, tmp_path / "liver.h5")
     save_recording(recording_of(organ, tips, forces), tmp_path / "push.h5")
@@ -296,7 +296,7 @@ def test_the_command_says_and_writes_what_was_found(run: Command, tmp_path: Path
 def test_the_command_calls_a_wrong_model_wrong(
     run: Command, organ: Vademecum, tips: np.ndarray, forces: np.ndarray, tmp_path: Path
 ) -> None:
-    """Some places are four times as hard, which no material of one organ is."""
+    """Some places are four times as hard, unlike any material of one organ."""
     hard = forces.copy()
     hard[: len(hard) // 3] *= 4.0
     save_recording(recording_of(organ, tips, hard), tmp_path / "hard.h5")
@@ -332,12 +332,12 @@ def test_the_command_refuses_in_a_line(
 
 N = 25
 FREEDOM = 4.0
-SOFTER = np.ones((N, 1))  # what Young's modulus does: all touches alike
+SOFTER = np.ones((N, 1))  # effect of Young's modulus: all touches alike
 
 
 @pytest.fixture(scope="module")
 def places() -> np.ndarray:
-    """A square of touches 20 mm apart."""
+    """Return a square of touches 20 mm apart."""
     across = 20e-3 * np.arange(5)
     flat = np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2)
     return np.c_[flat, np.zeros(N)]
@@ -345,7 +345,7 @@ def places() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def bump(places: np.ndarray) -> np.ndarray:
-    """The middle touch and its four neighbours deviate to one side."""
+    """Return deviations to one side for the middle touch and its four neighbours."""
     over = np.linalg.norm(places - places[12], axis=1) < 25e-3
     return np.where(over, 1.8, -0.45)
 
@@ -353,7 +353,7 @@ def bump(places: np.ndarray) -> np.ndarray:
 def test_touches_that_deviate_alike_around_a_place_are_found_out(
     places: np.ndarray, bump: np.ndarray
 ) -> None:
-    """As over something hard that the model lacks; the same deviations elsewhere are chance."""
+    """They lie over something hard that the model lacks; elsewhere the same ones are chance."""
     assert local_chance(bump, places, SOFTER) < LEAST_PROBABILITY / 2.0
     mixed = [np.random.default_rng(k).permutation(bump) for k in range(20)]
     assert np.median([local_chance(scores, places, SOFTER) for scores in mixed]) > 0.1
@@ -362,7 +362,7 @@ def test_touches_that_deviate_alike_around_a_place_are_found_out(
 
 
 def test_what_a_parameter_can_imitate_is_its_own(places: np.ndarray, bump: np.ndarray) -> None:
-    """A model with a contrast has fitted away what deviates as the contrast does."""
+    """A model with a contrast has fitted away deviations like the contrast's."""
     assert local_chance(bump, places, np.c_[SOFTER, bump]) > 0.9
 
 
@@ -377,7 +377,7 @@ def test_chance_is_called_so(places: np.ndarray) -> None:
 
 
 def test_errors_larger_than_stated_are_found_out(places: np.ndarray) -> None:
-    """Wherever they are."""
+    """They may lie anywhere."""
     rng = np.random.default_rng(2)
     drawn = rng.standard_t(FREEDOM, (20, N))
     stated = [chance(d, places, SOFTER, FREEDOM) for d in drawn]

@@ -31,7 +31,7 @@ from tests.helpers.box_organ import UP, top
 from tests.helpers.contact import data_of, prepare, step
 from tests.helpers.soft_organ import organ_on_springs, soft_organ, soft_tumour
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds organs
 
 SPHERE, PATCH = Tip("sphere", 5e-3), Tip("patch", 8e-3)
 KNOWN: dict[str, Distribution] = {
@@ -50,14 +50,14 @@ def organ() -> Vademecum:
 def band_of(
     vademecum: Vademecum, data: ContactData, known: dict[str, Distribution], *tips: Tip
 ) -> ForceBand:
-    """Of a model of a vademecum at its values."""
+    """Return the band of a vademecum's model at its values."""
     edges = log_edges(vademecum, tips, known)
     ratio = edges - log_forces(vademecum, tips)[..., None]
     return ForceBand(data, ratio.astype(np.float32), DEPTHS)
 
 
 def press(data: ContactData, tip: Tip, point: np.ndarray, normal: np.ndarray, d: float) -> float:
-    """The force on a tip that comes down to a depth."""
+    """Return the force on a tip that comes down to a depth."""
     data.reset()
     for depth in np.append(np.arange(-2e-3, d, 1e-3), d):
         step(data, (point + (tip.offset - depth) * normal)[None])
@@ -69,7 +69,7 @@ def model_of(vademecum: Vademecum, tip: Tip) -> ContactData:
 
 
 def spots(vademecum: Vademecum, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points amid the load positions, and normals there: centroids of inner faces far apart."""
+    """Return points amid the load positions, with normals: centroids of distant inner faces."""
     surface, inner = vademecum.surface, np.zeros(vademecum.surface.n_positions, bool)
     inner[inner_positions(vademecum)] = True
     faces = np.flatnonzero(inner[surface.corners].all(axis=1))
@@ -83,7 +83,7 @@ def spots(vademecum: Vademecum, n: int) -> tuple[np.ndarray, np.ndarray]:
 def pressed_bands(
     vademecum: Vademecum, tip: Tip, points: np.ndarray, normals: np.ndarray, known: Sequence
 ) -> np.ndarray:
-    """Edges of tips that are pressed at every point of the coordinates, (2, n_places, n_depths)."""
+    """Return edges of tips pressed at every point of the coordinates, (2, n_places, n_depths)."""
     grid, force = MaterialGrid.of(vademecum), []
     for here in grid.materials(vademecum):
         data = model_of(here, tip)
@@ -98,14 +98,14 @@ def pressed_bands(
     return bands_of(table, known).force[[0, 2]]
 
 
-# --- what is prepared --------------------------------------------------------------------------
+# --- preparation -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "tip", [SPHERE, pytest.param(PATCH, marks=pytest.mark.long)], ids=lambda tip: tip.shape
 )
 def test_edges_are_those_of_tips_pressed_anywhere(organ: Vademecum, tip: Tip) -> None:
-    """Amid the load positions, at depths between and at those prepared; goal: 3 % of the force."""
+    """Amid the load positions, at prepared depths and between; goal: 3 % of the force."""
     known, (points, normals) = known_of(organ, KNOWN), spots(organ, 6)
     truth = pressed_bands(organ, tip, points, normals, known)
     here = organ.at(young=20e3, poisson=0.4, contrast=6.0)
@@ -122,8 +122,11 @@ def test_edges_are_those_of_tips_pressed_anywhere(organ: Vademecum, tip: Tip) ->
 
 
 def test_a_tip_over_a_tumour_feels_its_modulus(organ: Vademecum) -> None:
-    """Half of the energy under each tip is the tumour's, six times as stiff as the organ; or none
-    of it: what that makes of the force, in a step and as it is prepared."""
+    """Compare the tumour's factor on the force in a step with the prepared one.
+
+    The tumour stores half or none of the energy under each tip, and is six times as stiff as the
+    organ.
+    """
     field, soft = organ.tip_field, organ.at(contrast=6.0)
     points, normals = organ.surface.centers, organ.surface.normals
     places, found, prepared = inner_positions(organ)[::60], [], []
@@ -167,8 +170,7 @@ def test_the_band_stays_where_it_is_while_the_material_changes(organ: Vademecum)
 
 
 def test_a_support_counts_over_young() -> None:
-    """At twice the modulus and stiffness the force is twice as large; a stiffer support alone is
-    felt less."""
+    """At twice the modulus and stiffness the force doubles; a stiffer support alone counts less."""
     organ = organ_on_springs()
     own = organ.supports[0].stiffness
     edges = []
@@ -180,7 +182,7 @@ def test_a_support_counts_over_young() -> None:
     assert (stiffer > 0.0).all() and (stiffer < np.log(2.0)).all()
     both = known_of(organ, {"young": Lognormal(0.17e6, 1.3)})
     low, high = np.moveaxis(log_edges(organ, [PATCH], both), -1, 0)
-    assert (high - low < 2.0 * 1.6449 * np.log(1.3)).all()  # of which the support keeps a part
+    assert (high - low < 2.0 * 1.6449 * np.log(1.3)).all()  # the support keeps a part of it
 
 
 def test_compliances_are_those_of_the_vademecum_at_these_values(organ: Vademecum) -> None:
@@ -194,11 +196,11 @@ def test_compliances_are_those_of_the_vademecum_at_these_values(organ: Vademecum
         np.testing.assert_allclose(whole[5], direct, rtol=1e-5, atol=1e-10)
 
 
-# --- what a step makes of it -------------------------------------------------------------------
+# --- bands of a step ---------------------------------------------------------------------------
 
 
 def ratios_of(data: ContactData, low: float, high: float) -> np.ndarray:
-    """The same everywhere, of each tool its number times as much."""
+    """Return ratios that are equal everywhere, times the number of each tool."""
     shape = (data.model.n_tools, len(data.model.arrays.position), len(DEPTHS))
     ratio = np.stack([np.full(shape, np.log(low)), np.full(shape, np.log(high))], axis=-1)
     return (ratio * np.arange(1, data.model.n_tools + 1)[:, None, None, None]).astype(np.float32)
@@ -268,7 +270,7 @@ def test_without_prepared_arrays_there_is_no_band(phantom_vademecum: Vademecum) 
     assert ForceBand.of(data, arrays) is not None
 
 
-# --- what a vademecum holds --------------------------------------------------------------------
+# --- contents of a vademecum -------------------------------------------------------------------
 
 
 def test_what_a_vademecum_holds_is_sent_and_judges_alike(organ: Vademecum) -> None:
@@ -291,7 +293,7 @@ def test_a_fixed_support_fixes_young_whatever_its_median() -> None:
         known_of(organ, {"young": Lognormal(own, 1.3)})
 
 
-# --- How far the force is not known over the surface ----------------------------------------------
+# --- Spread of the force over the surface ---------------------------------------------------------
 
 
 def test_a_spread_of_young_alone_is_the_same_everywhere() -> None:
@@ -313,7 +315,7 @@ def test_what_is_known_has_no_spread() -> None:
 
 
 def test_an_unknown_tumour_shows_where_it_is() -> None:
-    """Of the contrast alone, the force over the tumour is less known than that far from it."""
+    """Only the contrast is uncertain: the spread is larger over the tumour than far from it."""
     soft = soft_organ()
     known = known_of(soft, {"contrast": Lognormal(3.0, 1.5), "poisson": Fixed(0.45)})
     spread = force_spread_at(soft, SPHERE, known, soft.surface.centers)

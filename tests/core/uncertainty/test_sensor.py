@@ -1,4 +1,4 @@
-"""A sensor's zero and lag are found on the path, and what is left of them is not called good."""
+"""A sensor's zero and lag are found on the path; larger remainders are reported."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from avatar_core.vademecum.model import Vademecum
 from tests.helpers.soft_organ import soft_organ
 from tests.helpers.touches import SPHERE, felt, path_over
 
-pytestmark = pytest.mark.long  # for the paths that it steps
+pytestmark = pytest.mark.long  # it steps the paths
 
 TRUE = {"young": 6e3, "poisson": 0.45, "contrast": 5.0}
 STEP = 5e-3  # [s]: pushes of 0.6 s
@@ -31,7 +31,7 @@ class Path(NamedTuple):
     force: np.ndarray
 
     def later(self, lag: float) -> np.ndarray:
-        """The forces as one that lags measures them."""
+        """Return the forces as a lagging sensor measures them."""
         return np.column_stack([np.interp(self.time - lag, self.time, one) for one in self.force.T])
 
 
@@ -75,7 +75,7 @@ def test_forces_are_those_without_a_zero_on_any_axis(
 
 
 def test_what_the_way_out_does_not_give_back_is_told(organ: Vademecum, path: Path) -> None:
-    """As of tissue that relaxes; forces that run ahead are not told from it, nor moved."""
+    """Relaxing tissue looks like this; forces that run ahead are not told apart, nor shifted."""
     depth = -np.linalg.norm(path.tip - organ.mesh.vertices.mean(axis=0), axis=1)
     rising = np.r_[True, np.diff(depth) > 0.0]
     force = path.force * np.where(rising, 1.0, 0.8)[:, None]

@@ -39,7 +39,7 @@ from tests.core.conftest import Command
 from tests.helpers.paths import PARAMS
 from tests.helpers.soft_organ import organ_on_springs, soft_organ, soft_tumour
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds organs
 
 DEPTHS = [1e-3, 3e-3]
 PATCH = Tip("patch", 8e-3)
@@ -150,7 +150,7 @@ def test_shipped_files_are_understood(phantom_vademecum: Vademecum) -> None:
 
 
 def test_a_band_of_young_is_that_of_the_force(phantom_vademecum: Vademecum) -> None:
-    """F ~ E at an imposed depth, and what moves does not know E."""
+    """F ~ E at an imposed depth, and the motion does not depend on E."""
     v, factor = phantom_vademecum, 1.4
     places = starts_apart(v, 2)
     table = force_table(v, Tip("sphere", 5e-3), places, DEPTHS, target=0)
@@ -177,7 +177,7 @@ def test_a_place_where_nothing_is_felt_is_named(phantom_vademecum: Vademecum) ->
 
 
 def test_a_deep_push_alone_is_felt_as_after_others(phantom_vademecum: Vademecum) -> None:
-    """The tip comes down in small steps: it is not taken for one that jumped into the organ."""
+    """The tip comes down in small steps, so it does not count as one that jumped into the organ."""
     v, tip, places = phantom_vademecum, Tip("sphere", 5e-3), starts_apart(phantom_vademecum, 1)
     alone = force_table(v, tip, places, [14e-3], target=0).log_force
     after = force_table(v, tip, places, [2e-3, 5e-3, 8e-3, 11e-3, 14e-3], target=0).log_force
@@ -227,7 +227,7 @@ def values_of(known: dict[str, Distribution], n: int) -> dict[str, np.ndarray]:
 
 
 def forces_of(vademecum: Vademecum, places: list[int]) -> np.ndarray:
-    """Of its own material, (n_places, n_depths) [N]."""
+    """Return the forces for the vademecum's own material, (n_places, n_depths) [N]."""
     model = model_of(vademecum, (PATCH,), 1, "off")
     return _pressed(model, vademecum.surface, PATCH, places, DEPTHS)
 
@@ -264,7 +264,7 @@ def test_bands_hold_what_full_finite_elements_find(
 
 
 def test_supports_count_over_young() -> None:
-    """At another E, the table is asked for the stiffness of supports that is the same over E."""
+    """At another E, the table is asked for the same stiffness of supports relative to E."""
     organ = organ_on_springs()
     places = starts_apart(organ, 1)
     table = force_table(organ, PATCH, places, DEPTHS, target=0)
@@ -280,7 +280,7 @@ def test_supports_count_over_young() -> None:
 def test_a_clamped_target_does_not_move(
     organ: Vademecum, place: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At any material; what is zero at all points of the table has no logarithm."""
+    """For any material: a target that is zero at all points of the table has no logarithm."""
     monkeypatch.setattr(material_grid, "N_POINTS", 2)
     held = int(organ.mesh.boundary_faces[organ.regions.clamped][0, 0])
     table = force_table(organ, PATCH, [place], DEPTHS, target=held)
@@ -291,7 +291,7 @@ def test_a_clamped_target_does_not_move(
 def test_shares_add_up_and_name_the_parameter_that_matters(bands: Bands) -> None:
     shares = {name: float(share[0, 0]) for name, share in bands.shares.items()}
     assert set(shares) == set(KNOWN)
-    assert shares["young"] > 0.5  # whose factor is the force's own
+    assert shares["young"] > 0.5  # its factor is that of the force
     assert 0.95 < sum(shares.values()) < 1.05  # ln F is nearly a sum
 
 
@@ -306,7 +306,7 @@ def test_the_same_seed_gives_the_same_bands(table: ForceTable, organ: Vademecum)
 
 @pytest.fixture
 def run(avatar: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
-    """Runs ``avatar uncertainty liver.h5 ...``: exit code, output and errors."""
+    """Run ``avatar uncertainty liver.h5 ...``; return exit code, output and errors."""
     monkeypatch.chdir(tmp_path)
     return partial(avatar, "uncertainty", "liver.h5")
 

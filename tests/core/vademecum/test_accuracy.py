@@ -31,7 +31,7 @@ from tests.helpers.contact import data_of, estimate_error, prepare, step
 
 
 def some_curve(seed: int) -> AccuracyCurve:
-    """A curve in which error and time are related only loosely."""
+    """Return a curve in which error and time are related only loosely."""
     rng = np.random.default_rng(seed)
     points = []
     for modes, cloud in product(range(5, 50, 5), ("surface", "volume")):
@@ -78,8 +78,8 @@ def test_infeasible_budget_names_the_two_nearest_points() -> None:
         choose(AccuracyCurve(points, 1), Budget(0.05, 20e-6))
     message = str(refusal.value)
     assert "\n" not in message
-    assert "0.04 in 60 us (50 modes" in message  # the fastest that is exact enough
-    assert "0.2 in 12 us (10 modes" in message  # the most exact that is fast enough
+    assert "0.04 in 60 us (50 modes" in message  # the fastest within the error
+    assert "0.2 in 12 us (10 modes" in message  # the most accurate within the time
     assert "0.03" not in message
 
 
@@ -134,7 +134,7 @@ def test_certified_errors_hold_on_fresh_loads(phantom_vademecum: Vademecum) -> N
 
 
 def test_fewer_modes_leave_the_force_as_it_is(phantom_vademecum: Vademecum) -> None:
-    """To the bit; the cloud comes nearer to the whole one with every mode."""
+    """To the bit; the cloud approaches the full one with every mode."""
     v = phantom_vademecum
     data = prepare(v, cloud="volume")
     tip = palpation(v, 5e-3, 3e-3, 41)[20]
@@ -175,11 +175,11 @@ def test_timing_finds_more_modes_slower(phantom_vademecum: Vademecum) -> None:
     assert all(point.p50 <= point.p99 for point in found.points)
 
 
-# --- The error that goes with the force ----------------------------------------------------------
+# --- The force's stated error --------------------------------------------------------------------
 
 
 def test_calibration_covers_and_is_sharp() -> None:
-    """Errors that grow with smoothing: covered to nine in ten, at most three times too large."""
+    """Errors grow with smoothing: covered to nine in ten, at most three times too large."""
     rng = np.random.default_rng(0)
     smoothing = rng.exponential(0.03, 4000)
     error = np.abs(rng.normal(size=4000)) * (0.6 * smoothing + 0.01)
@@ -196,7 +196,7 @@ def test_no_estimate_without_a_measurement() -> None:
 def test_error_that_goes_with_the_force_covers_unseen_contacts(
     phantom_vademecum: Vademecum,
 ) -> None:
-    """By the step itself; and the estimate is not so large as to say nothing."""
+    """By the step itself; the estimate is small enough to be useful."""
     v = phantom_vademecum
     problem = Elasticity(v.mesh, v.material, v.regions.clamped)
     touched = step_errors(v, problem, 150, seed=7)

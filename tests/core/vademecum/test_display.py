@@ -1,4 +1,4 @@
-"""What is displayed beside the mesh: a finer surface, and structures that move with the organ."""
+"""Displays beside the mesh: a finer surface, and structures that move with the organ."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_surface_gets_about_so_many_vertices_and_stays_itself(n: int) -> None:
 
 
 def bends(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Angle between the triangles at an edge, rms over the length of the edges [degrees]."""
+    """Return the angle between triangles at an edge, rms over the edges' length [degrees]."""
     normals = igl.per_face_normals(vertices, faces, np.zeros(3))
     beside, _ = igl.triangle_triangle_adjacency(faces)
     angles = np.arccos(np.clip((normals[:, None] * normals[beside]).sum(axis=2), -1.0, 1.0))
@@ -55,7 +55,7 @@ def bends(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 
 def radius_of(volume: float) -> float:
-    """Of a ball [m]."""
+    """Return the radius of a ball [m]."""
     return float(np.cbrt(volume / (4.0 / 3.0 * np.pi)))
 
 
@@ -127,11 +127,11 @@ def test_the_volume_shows_the_mesh() -> None:
 
 
 def test_a_structure_moves_with_the_organ() -> None:
-    """As the volume does between the vertices of the mesh; the organ's own part is as without."""
+    """Between the vertices of the mesh it moves as the volume; the organ's part is unchanged."""
     cube, lesion = organ("cube"), lesion_at(top("cube") + np.array([2e-3, -12e-3, 1e-3]), 8e-3)
     display = display_of(cube.mesh, boundary(cube.mesh), [("lesion", structure(lesion))])
     with_lesion = replace(cube, display=display)
-    tip = Tip("patch", SPHERE.radius)  # whose field the modes hold as a whole
+    tip = Tip("patch", SPHERE.radius)  # the modes hold its field as a whole
     at = (top("cube")[None], UP[None], DEPTH)
     cloud = displaced(prepare(with_lesion, (tip,), effects=()), (tip,), *at)
     n, volume = len(cube.surface_vertices), prepare(cube, (tip,), cloud="volume", effects=())

@@ -1,4 +1,4 @@
-"""The surface that a tool tip feels is the one that was read."""
+"""The contact surface of a tool tip agrees with the surface that was read."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from tests.helpers.known_surfaces import ball
 PATCH = 12e-3
 RADIUS = 40e-3  # of the ball
 TIP = 3e-3  # radius of a ball that follows the surface away from its edges
-OVERLAP = 1e-4  # by which it may do so
+OVERLAP = 1e-4  # largest overlap of such a ball
 OFFSETS = np.array([0.0, 1.5e-3, 3e-3, 10e-3, 20e-3])
 
 
 def phi(field: TipField, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (n,) and its gradient (n, 3)."""
+    """Return distance (n,) and its gradient (n, 3)."""
     slope = np.zeros((len(points), 3))
     value = [
         evaluate(field.distance, field.origin, field.spacing[0], p, g, FAR)
@@ -36,7 +36,7 @@ def phi(field: TipField, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def coarse_ball() -> tuple[TetMesh, Regions]:
-    """A ball of 80 faces, up to 2 mm beside the true one, accessible in front of its middle."""
+    """Return a ball of 80 faces, up to 2 mm beside the true one, accessible in front."""
     surface = ball(RADIUS, level=1)
     apex = np.full((len(surface.faces), 1), len(surface.vertices))
     mesh = TetMesh(
@@ -53,7 +53,7 @@ def field_of_ball() -> TipField:
 
 @cache
 def field_of_edge() -> TipField:
-    """Of a box, 0.1 m wide, on two sides of the edge x = y = 0.1 m."""
+    """Return a box, 0.1 m wide, on two sides of the edge x = y = 0.1 m."""
     mesh = box_mesh(4)
     faces = mesh.vertices[mesh.boundary_faces]
     upper = (faces[:, :, 1].min(axis=1) > 0.099) | (faces[:, :, 0].min(axis=1) > 0.099)
@@ -61,7 +61,7 @@ def field_of_edge() -> TipField:
 
 
 def directions(n: int) -> np.ndarray:
-    """Unit vectors into the accessible half, at least 30 degrees off its rim."""
+    """Return unit vectors into the accessible half, at least 30 degrees off its rim."""
     v = np.random.default_rng(0).normal(size=(4 * n, 3))
     v /= np.linalg.norm(v, axis=1, keepdims=True)
     return v[v[:, 1] > 0.5][:n]
@@ -92,7 +92,7 @@ def test_a_plane_is_exact_and_a_thin_plate_has_no_back() -> None:
     for height in (-10e-3, -5e-3, *OFFSETS):
         points = np.stack([x, np.full(200, thickness + height), z], axis=1)
         distance, slope = phi(field, points)
-        # inside, the distance jumps at the back: the splines feel it two spacings before
+        # inside, the distance jumps at the back: the splines smooth it over two spacings
         atol = 1e-3 if height < 0.0 else 1e-5
         np.testing.assert_allclose(distance, height, atol=atol)
         if height >= 0.0:
@@ -134,7 +134,7 @@ def test_a_real_liver_is_felt_where_its_surface_is(livers_dir: Path) -> None:
 
 
 def coarsened(surface: SurfaceMesh) -> tuple[TetMesh, Regions]:
-    """As much of a coarse mesh as the field needs, its boundary; accessible from the front."""
+    """Coarsen a surface to the boundary that the field needs; accessible from the front."""
     vertices, faces = igl.decimate(surface.vertices, surface.faces, 800)[:2]
     vertices, faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
     mesh: Any = SimpleNamespace(vertices=vertices, boundary_faces=faces)
@@ -147,7 +147,7 @@ def coarsened(surface: SurfaceMesh) -> tuple[TetMesh, Regions]:
 def surface_points(
     surface: SurfaceMesh, mesh: TetMesh, regions: Regions, n: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the surface over the accessible faces, 6 mm off their rim, and unit normals."""
+    """Return points over accessible faces, 6 mm off their rim, and unit normals."""
     rng = np.random.default_rng(2)
     corner = surface.vertices[surface.faces]
     area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -161,6 +161,6 @@ def surface_points(
 
 
 def follows(surface: SurfaceMesh, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Where a ball of 3 mm that touches the surface, from either side, hardly overlaps it."""
+    """Return where a ball of 3 mm that touches the surface, on either side, hardly overlaps it."""
     room = [abs(surface.skin.signed_distance(points + s * TIP * normals)) for s in (1.0, -1.0)]
     return np.min(room, axis=0) > TIP - OVERLAP

@@ -1,4 +1,4 @@
-"""The vademecum: its promise on unseen loads, positivity, symmetry, storage."""
+"""The vademecum: its error on unseen loads, positivity, symmetry, storage."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_certificate_sees_a_damaged_vademecum(phantom_vademecum: Vademecum) -> N
 
 
 def test_loads_of_the_build_are_answered_within_its_tolerance(phantom_vademecum: Vademecum) -> None:
-    """At load positions nothing is interpolated: what is left is what the modes leave."""
+    """At load positions nothing is interpolated: only the truncation error remains."""
     from avatar_core.fem.patch_loads import patch_loads
 
     v = phantom_vademecum
@@ -75,7 +75,7 @@ def test_loads_of_the_build_are_answered_within_its_tolerance(phantom_vademecum:
             for k, j in enumerate(some)
         ]
     )
-    assert own.max() < 1e-3  # of single precision: compliances are stored as they were solved
+    assert own.max() < 1e-3  # single precision: compliances are stored as they were solved
 
 
 def test_file_gives_back_the_same_vademecum(phantom_vademecum: Vademecum, tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_foreign_hdf5_and_missing_file_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_full_disk_leaves_the_old_file(phantom_vademecum: Vademecum, tmp_path: Path) -> None:
-    """A write that fails half way (file size limit) keeps what was there, and no scraps."""
+    """A write that fails half way (file size limit) keeps the old file, and leaves no parts."""
     file = tmp_path / "a.h5"
     save_vademecum(phantom_vademecum, file)
     before = file.read_bytes()
@@ -175,7 +175,7 @@ def test_full_disk_leaves_the_old_file(phantom_vademecum: Vademecum, tmp_path: P
 
 
 def with_both(v: Vademecum) -> Vademecum:
-    """A phantom with a finer surface and a lesion."""
+    """Return a phantom with a finer surface and a lesion."""
     lesion = structure(lesion_at(v.mesh.vertices.mean(axis=0), 9e-3))
     organ_surface = outline(v.mesh, phantom_liver(), 3000)
     return replace(v, display=display_of(v.mesh, organ_surface, [("lesion", lesion)]))

@@ -1,4 +1,4 @@
-"""The measured cell runs, its figures hang together, and the loop keeps what the machine can."""
+"""The measured cell runs, its figures agree, and the loop keeps the machine's own pace."""
 
 from __future__ import annotations
 
@@ -26,17 +26,19 @@ def test_a_broken_vademecum_ends_the_measurement(library: Path) -> None:
 
 
 def on_time(run: CellMeasurement) -> bool:
-    """What the sleeping loop misses in the same seconds, this one may miss too.
+    """Return whether a loop missed no more than the sleeping loop in the same seconds, plus 5 %.
 
-    5 % is for the luck of two different loops on a shared machine. The targets are measured by
-    `avatar bench cell` on a quiet one.
+    The 5 % allow for chance in two different loops on a shared machine. The targets are measured by
+    `avatar bench cell` on a quiet machine.
     """
     return run.on_time_fraction > run.floor_on_time_fraction - 0.05
 
 
 def best_of(tries: int, measure: Callable[[], CellReport]) -> CellReport:
-    """The first report in which every loop was on time, or the last: what else a machine does
-    makes a loop late, never early."""
+    """Return the first report in which every loop was on time, or the last one.
+
+    Other load of a machine makes a loop late, never early.
+    """
     for _ in range(tries):
         report = measure()
         if all(on_time(run) for run in (report.real_time, report.ordinary) if run is not None):
@@ -67,13 +69,13 @@ def test_the_cell_keeps_time(library: Path, tmp_path: Path) -> None:
         assert run.latency.p50_ms < 1.0
         assert run.cloud_hz > 0.5 * run.rate_hz
         touched = np.linalg.norm(run.round_trips.forces, axis=1) > 0.1
-        assert 0.3 < touched.mean() < 0.9  # of a touch, pushing and sliding make 0.7
+        assert 0.3 < touched.mean() < 0.9  # pushing and sliding make 0.7 of a touch
 
 
 @pytest.mark.long
 @pytest.mark.timing
 def test_the_cell_keeps_time_while_the_material_changes(library: Path) -> None:
-    # the next is asked for when the last is in use: a busy machine makes fewer of the twenty
+    # each change follows once the last is in use: a busy machine makes fewer of the twenty
     seconds = 10.0 * min(slowness(), 5.0)
     report = best_of(
         3, lambda: run_cell(library / "liver.h5", seconds, ordinary=False, changes=2.0)

@@ -1,4 +1,4 @@
-"""What the processes of a measured cell take more and more of, if anything; no times are asked."""
+"""Growth of a measured cell's processes; no times are required."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from avatar_ros.bench.footprint import Footprint, FootprintGrowth
 
 @pytest.mark.long
 def test_nothing_grows_in_a_minute(library: Path) -> None:
-    """The times of a soak are measured by `avatar bench cell --seconds 600` on a quiet machine."""
+    """`avatar bench cell --seconds 600` on a quiet machine measures the times of a soak."""
     report = run_cell(library / "liver.h5", 60.0, real_time=False)
     run = report.ordinary
     assert run is not None
@@ -34,7 +34,7 @@ print(flush=True), sys.stdin.readline()
 
 
 def test_what_grows_is_complained_of(tmp_path: Path) -> None:
-    """Of a process that does nothing else, as this one, with threads of other tests, may."""
+    """The process does nothing else, unlike this one with threads of other tests."""
     with subprocess.Popen(
         [sys.executable, "-S", "-c", _GROWING, str(tmp_path / "file")],
         stdin=subprocess.PIPE,

@@ -1,4 +1,4 @@
-"""Nodes with nothing to do rest, and are there at once when there is something."""
+"""Idle nodes rest, and react at once to work."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from tests.ros.helpers.running import running
 
 pytestmark = pytest.mark.long
 
-# Wake-ups a second. A busy machine makes them fewer, never more; times would say nothing there.
+# Wake-ups per second. A busy machine makes fewer, never more; times would say nothing there.
 MOST_LOOP = 15.0  # ten steps
 MOST_MAIN = 5.0  # one report
-MOST_OF_OTHERS = 30.0  # the middleware's own, some eight
+MOST_OF_OTHERS = 30.0  # the middleware's own, about eight
 
 
 def test_idle_nodes_wake_up_for_little(own_domain: dict[str, str]) -> None:

@@ -1,4 +1,4 @@
-"""The measured start: its stages come in order, its figures hang together, and nothing stays."""
+"""The measured start: its stages come in order, its figures agree, and no process stays."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from tests.helpers.slowness import wait_until
 pytestmark = pytest.mark.long
 
 
-MARK = "AVATAR_MEASURED_START"  # in the environment of all that the measured start starts
+MARK = "AVATAR_MEASURED_START"  # in the environment of all processes of the measured start
 
 
 def marked(value: str) -> set[int]:
-    """Processes with this value of the mark, but for this one."""
+    """Return processes with this value of the mark, except this one."""
     found = set()
     for environment in Path("/proc").glob("[0-9]*/environ"):
         try:
             if f"{MARK}={value}".encode() in environment.read_bytes().split(b"\0"):
                 found.add(int(environment.parent.name))
-        except OSError:  # it ended meanwhile
+        except OSError:  # it has ended
             continue
     return found - {os.getpid()}
 

@@ -1,4 +1,4 @@
-"""Announcements of several nodes are not taken; those of the last one left are."""
+"""Announcements of several nodes are not taken; those of the last remaining one are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever a client sends to a standard service, the service answers and the node goes on."""
+"""A standard service answers any request, and the node goes on."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ NAMES = ["", "no.such", "x" * 5000, "a\nb", "\x1b[31m"]
 
 
 class Client:
-    """Asks the services of one node, each of which it has discovered before."""
+    """Client of one node's services, each of which it has discovered before."""
 
     def __init__(self, probe: Any, node: str) -> None:
         make = probe.node.create_client
@@ -123,7 +123,7 @@ def refuse_transitions(ask: Client) -> None:
 
 
 def refuse_parameters(ask: Client) -> None:
-    """Each for itself, with a reason; those beside them are set."""
+    """Each is refused separately, with a reason; the others are set."""
     sound = Parameter(name="use_sim_time", value=ParameterValue(type=1, bool_value=False))
     wrong = [Parameter(name=name, value=UNKNOWN_TYPE) for name in ("autostart", "no.such")]
     wrong += [Parameter(name="autostart", value=ParameterValue(type=9))]

@@ -1,4 +1,4 @@
-"""Serialised templates say what message objects would say, and read what may come as a pose."""
+"""Serialised templates equal message objects, and read any pose."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_state(n_contacts: int, identity: str) -> None:
     assert state.force_error == 0.125
 
 
-# --- Anything that a pose may be ------------------------------------------------------------------
+# --- Any pose -------------------------------------------------------------------------------------
 
 often = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 INVALID = int(ContactState.STATUS_INVALID_POSE)
@@ -127,7 +127,7 @@ def test_numbers_beyond_all_measure_are_refused(numbers: tuple[float, ...]) -> N
 @often
 @given(st.data())
 def test_no_bytes_upset_the_reader(data: st.DataObject) -> None:
-    """Flipped, cut, continued or made up: a status, and nothing of it is kept if it is not OK."""
+    """Flipped, cut, continued or random bytes: a status, and nothing is kept unless it is OK."""
     reader, whole = PoseReader("organ"), bytearray(pose(np.array([1.0, 2.0, 3.0])))
     for place, value in data.draw(
         st.lists(st.tuples(st.integers(0, len(whole) - 1), st.integers(0, 255)), max_size=8)

@@ -50,7 +50,7 @@ def test_a_process_that_ends_by_itself_does_so_before() -> None:
 def test_a_node_that_still_reads_its_organ_ends(
     own_domain: dict[str, str], organ: Any, tmp_path: Path, number: signal.Signals
 ) -> None:
-    """However long that would take: the process that reads is held."""
+    """The reading process is stopped, so that reading would never end."""
     save_vademecum(organ, tmp_path / "liver.h5")
     arguments = ["-p", f"library_dir:={tmp_path}", "-p", "vademecum:=liver.h5"]
     node = Module("vademecum_loader", ["--ros-args", *arguments], own_domain)
@@ -65,7 +65,7 @@ def test_a_node_that_still_reads_its_organ_ends(
 
 
 def reader_of(node: Module) -> int:
-    """The process that reads files for a node, once there is one."""
+    """Wait for the process that reads files for a node."""
 
     def reading() -> list[int]:
         words = {child: Path(f"/proc/{child}/cmdline").read_bytes() for child in children(node.pid)}

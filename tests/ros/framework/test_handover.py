@@ -1,4 +1,4 @@
-"""Arrays handed from one process to another by shared memory."""
+"""Arrays passed from one process to another by shared memory."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_arrays_arrive_as_they_were() -> None:
     for name, values in sent.items():
         np.testing.assert_array_equal(received[name], values)
         assert received[name].dtype == values.dtype
-        assert type(received[name]) is np.ndarray  # compiled code is compiled for these
+        assert type(received[name]) is np.ndarray  # compiled code expects these
         assert received[name].flags.aligned and received[name].flags.writeable
 
 
@@ -48,7 +48,7 @@ def test_neither_side_can_alter_what_was_handed_over() -> None:
 
 
 def test_the_receiving_process_ends_with_the_node(own_domain: dict[str, str]) -> None:
-    """Which may have been killed before its child could ask to be told."""
+    """The node may have been killed before its child could ask to be told."""
     ours, theirs = Channel.pair()
     request = PreparationRequest("vademecum", "orphan", "/", (0.005,), None, "surface", 1e-3)
     Channel(ours).send(request)

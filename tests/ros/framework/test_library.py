@@ -1,4 +1,4 @@
-"""Names from the network: inside the library, ordinary files, one line about the others."""
+"""Names from the network: ordinary files inside the library; one line refuses the others."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from avatar_ros.srv import InterpolatePatient
 
 @pytest.fixture
 def shelf(tmp_path: Path) -> Path:
-    """A library with one file and ways out."""
+    """Fill a library with one file and links out."""
     folder = tmp_path / "library"
     (folder / "sub").mkdir(parents=True)
     (folder / "a.h5").write_bytes(b"inside")
@@ -84,7 +84,7 @@ def test_names_inside_are_found(shelf: Path) -> None:
 def test_a_library_that_is_changed_meanwhile_leads_nowhere(
     shelf: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The name becomes a link out between the look and the opening."""
+    """The name becomes a link out between the check and the opening."""
     true = library.opened
 
     def swapped(path: Path, max_bytes: int) -> Any:

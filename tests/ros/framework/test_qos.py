@@ -1,4 +1,4 @@
-"""Quality of service by parameters: what passes, what is refused, and who is told."""
+"""Quality of service by parameters: accepted and refused values, and who is told."""
 
 from __future__ import annotations
 
@@ -115,13 +115,13 @@ def test_reliable_subscribers_that_stand_still_do_not_hold_up_the_loop(
         f"{1e6 * asleep.compute_p50:.0f} us, {1e6 * asleep.compute_p99:.0f} us, "
         f"{asleep.rate:.0f} Hz"
     )
-    # tells a loop that goes on from one that waits for them, a tenth of a second each time
+    # distinguishes a loop that goes on from one that waits for each of them for 0.1 s
     assert asleep.rate > 0.5 * awake.rate
     assert asleep.compute_p99 < 0.05 * slowness()
 
 
-# --- One contact node for the tests of its defaults, then one for those of its overrides ---------
-# Each is there until it is another's turn: what starts its own comes before.
+# --- One contact node for the tests of its defaults, then one for the tests of its overrides ------
+# each runs until the other's turn: a test that starts its own comes before
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +166,7 @@ def test_a_driver_learns_by_its_deadline_that_the_wrenches_ended(
         asked,
         event_callbacks=SubscriptionEventCallbacks(deadline=missed.append),
     )
-    probe.until(lambda: len(heard) > 100, 60.0)  # it matches: as short a one is offered
+    probe.until(lambda: len(heard) > 100, 60.0)  # it matches: a deadline as short is offered
     contact.send_signal(signal.SIGSTOP)
     missed.clear()
     try:
@@ -177,7 +177,7 @@ def test_a_driver_learns_by_its_deadline_that_the_wrenches_ended(
 
 @overridden
 def test_a_driver_that_does_not_match_is_named(contact: Module, probe: Any) -> None:
-    """Shut out by a deadline that it does not offer, only since that was asked for."""
+    """A deadline that it does not offer shuts it out, from the request on."""
     topic = "tool/measured_cp"
     assert diagnosis(probe, lambda status: True).level == DiagnosticStatus.OK
     publisher = probe.node.create_publisher(PoseStamped, topic, qos.NEWEST)

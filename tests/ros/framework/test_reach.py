@@ -1,4 +1,4 @@
-"""Who reaches a node: by default this machine only, measured between two network namespaces."""
+"""Reach of a node: by default this machine only, measured between two network namespaces."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.ros.helpers.hosts import two_hosts
 
 FAST_DDS = "rmw_fastrtps_cpp"
 NODE = [sys.executable, "-m", "avatar_ros.nodes.vademecum_loader"]
-LISTENING = 8.0  # a peer that is answered is answered in 2 s [s]
+LISTENING = 8.0  # a peer gets an answer within 2 s, if at all [s]
 HEARD = """
 import time, rclpy
 from rcl_interfaces.msg import Log
@@ -99,13 +99,13 @@ def test_another_middleware_stays_on_this_machine(middleware: str) -> None:
 
 
 def _plain(environment: dict[str, str]) -> dict[str, str]:
-    """As a user's shell: nothing is said about who may take part."""
+    """Return the environment of a user's shell: nothing is set about discovery."""
     kept = {k: v for k, v in environment.items() if k not in (RANGE, PROFILES, TRANSPORTS)}
     return {k: v for k, v in kept.items() if k != "FASTDDS_DEFAULT_PROFILES_FILE"}
 
 
 def _listening(pid: int) -> set[str]:
-    """Addresses of the UDP ports of DDS on which a process receives, in this namespace."""
+    """List the addresses of the UDP ports of DDS on which a process receives, in this namespace."""
     inodes = set()
     for link in Path(f"/proc/{pid}/fd").iterdir():
         try:
@@ -138,7 +138,7 @@ def _threads(pid: int) -> str:
 def test_a_node_receives_on_the_loopback_alone(
     own_domain: dict[str, str], probe: Any, name: str, shared_memory: bool
 ) -> None:
-    """And the one that keeps time through no shared memory."""
+    """The time-critical node receives through no shared memory."""
     command = [sys.executable, "-m", f"avatar_ros.nodes.{name}"]
     node = subprocess.Popen(command, env=_plain(own_domain), cwd="/")
     try:
@@ -177,7 +177,7 @@ def test_another_machine_reaches_a_node_only_if_told(
 def test_security_that_is_not_there_lets_nothing_run(
     own_domain: dict[str, str], tmp_path: Path
 ) -> None:
-    """These wheels have no DDS security; with one that has, there is no key, and nothing runs."""
+    """These wheels have no DDS security; with security, the key is missing, and nothing runs."""
     environment = own_domain | {
         "ROS_SECURITY_ENABLE": "true",
         "ROS_SECURITY_STRATEGY": "Enforce",

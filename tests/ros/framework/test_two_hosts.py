@@ -53,7 +53,7 @@ def hosts(own_domain: dict[str, str], organ: Any, tmp_path: Path) -> Iterator[Ho
 
 
 class Ear:
-    """Lines of ``remote_listener.py``, until one is wanted."""
+    """Lines of ``remote_listener.py``, until a wanted one."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
@@ -108,5 +108,5 @@ def test_a_vademecum_crosses_and_a_dead_link_costs_no_more_than_itself(
         f"\ndead link for 5 s: zeros at {rate:.0f} Hz heard; force again {recovery:.2f} s after it "
         f"was up; another vademecum in use {crossed['at'] - float(asked):.2f} s after the request"
     )
-    # 0.2 s where nothing else runs; tells it from waiting for discovery
+    # 0.2 s on an idle machine; distinguishes it from waiting for discovery
     assert recovery <= 3.0 * slowness()

@@ -1,4 +1,4 @@
-"""A real browser on the planning page, and what a user does there."""
+"""A real browser on the planning page, and a user's actions there."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from tests.helpers.slowness import Deadline, end_of
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 TOKEN = "a-token-for-tests"  # of the page
 WINDOW = (1280, 800)  # [px]
-SLOW = 300_000  # of what starts, compiles or builds, on a busy machine [ms]
-# Software rendering: there is no graphics card where this runs.
+SLOW = 300_000  # time limit for starts, compilation or builds on a busy machine [ms]
+# software rendering: there is no graphics card here
 OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
 def shots_in(folder: Path) -> Path:
-    """Where screenshots are kept: AVATAR_SHOTS, if given."""
+    """Return the folder of screenshots: AVATAR_SHOTS, if given."""
     path = Path(os.environ.get("AVATAR_SHOTS") or folder)
     path.mkdir(exist_ok=True)
     return path
@@ -44,7 +44,7 @@ def free_port() -> int:
 def nodes_of_a_page(
     arguments: dict[str, list[str]], domain: dict[str, str]
 ) -> Iterator[dict[str, Module]]:
-    """Nodes by name; what a test kills, it starts again, and all end well."""
+    """Run nodes by name; a test restarts those that it kills, and all end well."""
     running = {
         name: Module(name, ["--ros-args", *words], domain) for name, words in arguments.items()
     }
@@ -53,21 +53,21 @@ def nodes_of_a_page(
     finally:  # a page that did not open leaves no nodes to other tests
         for process in running.values():
             process.send_signal(signal.SIGINT)
-        # `finish` is impatient where a browser shares the cores with all of them
+        # `finish` is impatient if a browser shares the cores with all of them
         codes = {name: end_of(process, 60.0) for name, process in running.items()}
     assert codes == dict.fromkeys(running, 0)
 
 
 @contextmanager
 def browsing(address: str, size: tuple[int, int] = WINDOW) -> Iterator[Any]:
-    """A browser at an address of this machine; it may ask nothing of any other."""
+    """Open a browser at an address of this machine; it may contact no other address."""
     from playwright.sync_api import Error, sync_playwright
 
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
         context = browser.new_context(viewport={"width": size[0], "height": size[1]})
         page = context.new_page()
-        page.set_default_timeout(SLOW)  # screenshots too, of a busy machine
+        page.set_default_timeout(SLOW)  # also for screenshots of a busy machine
         foreign: list[str] = []
         page.on("request", lambda asked: foreign.append(asked.url))
         for _ in range(60):
@@ -83,7 +83,7 @@ def browsing(address: str, size: tuple[int, int] = WINDOW) -> Iterator[Any]:
 
 
 def close_notices(page: Any) -> None:
-    """Software rendering takes its time, and says so."""
+    """Close the notices of slow software rendering."""
     from playwright.sync_api import Error
 
     page.wait_for_timeout(3000)
@@ -94,7 +94,7 @@ def close_notices(page: Any) -> None:
 
 @contextmanager
 def opened(port: int, shots: Path) -> Iterator[Any]:
-    """The page, with an organ and all nodes there."""
+    """Open the page, and wait until an organ and all nodes are there."""
     with browsing(f"http://127.0.0.1:{port}/?token={TOKEN}") as page:
         try:
             page.get_by_text("is shown").wait_for(timeout=SLOW)
@@ -106,19 +106,19 @@ def opened(port: int, shots: Path) -> Iterator[Any]:
 
 
 def browse_in_idle_time() -> None:
-    """Leave the cores to all others first, as a browser on another machine would.
+    """Give the cores to all others first, as a browser on another machine would.
 
     Chromium raises the priority of drawing above that of ordinary processes, if it may.
     """
     for process in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):  # it ended meanwhile
+        with suppress(OSError):  # it has ended
             if (process / "comm").read_text().startswith("chrom"):
                 for thread in (process / "task").iterdir():
                     os.sched_setscheduler(int(thread.name), os.SCHED_IDLE, os.sched_param(0))
 
 
 def force_of(page: Any, tool: str = "") -> float:
-    """As the page writes it [N]; of several tools, that of the named one, 0 if another is shown."""
+    """Read the force on the page [N]; with several tools the named one's, 0 if not shown."""
     on = f"on {tool} " if tool else ""
     found = re.search(rf"Force {on}([\d.]+) N", page.inner_text("body"))
     return float(found[1]) if found else 0.0
@@ -132,17 +132,17 @@ def until(page: Any, reached: Callable[[], bool], what: str, seconds: float = 12
 
 
 def first_pose(shown: Organ) -> Pose:
-    """Of the camera, before the view was turned."""
+    """Return the camera's pose before the view was turned."""
     return standard_view("A", shown.centre, shown.size)
 
 
 def beside_pose(shown: Organ) -> Pose:
-    """Of the camera beside the tool of a new organ."""
+    """Return the camera's pose beside the tool of a new organ."""
     return view_beside(shown.normal, shown.centre, shown.size)
 
 
 def screen_of(page: Any, pose: Pose, point: np.ndarray) -> tuple[float, float]:
-    """Where a point [m] is on the page, seen by a camera [px]."""
+    """Return where a point [m] is on the page, seen by a camera [px]."""
     right, up, towards = basis(pose)
     box = page.locator("canvas").first.bounding_box()
     way = point - pose.position
@@ -157,13 +157,13 @@ def look_beside(page: Any) -> None:
 
 
 def drag(page: Any, shown: Organ, begin: float, end: float) -> None:
-    """The tool from one height over the organ to another, with the mouse; the button stays down."""
+    """Drag the tool from one height over the organ to another; the button stays down."""
     look_beside(page)
     drag_there(page, beside_pose(shown), shown.above(begin), shown.above(end))
 
 
 def drag_there(page: Any, pose: Pose, begin: np.ndarray, end: np.ndarray) -> None:
-    """From a point to another [m], seen by a camera that is there already."""
+    """Drag from a point to another [m], seen by a camera that is there already."""
     way = np.linspace(screen_of(page, pose, begin), screen_of(page, pose, end), 20)
     page.mouse.move(*way[0])
     page.wait_for_timeout(500)
@@ -179,7 +179,7 @@ def choose(page: Any, label: str, option: str) -> None:
 
 
 def input_of(page: Any, label: str) -> Any:
-    """The text, or the number beside a slider, of a label, which is no label of theirs in HTML."""
+    """Find the text, or the number beside a slider, by its label, which is none in HTML."""
     return (
         page.get_by_text(label, exact=True)
         .locator("xpath=ancestor::*[.//input[not(@type='hidden')]][1]//input[not(@type='hidden')]")
@@ -193,7 +193,7 @@ def open_tab(page: Any, name: str) -> None:
 
 
 def news(page: Any, text: str) -> None:
-    """Wait until the page says so."""
+    """Wait until the page shows a message."""
     page.get_by_text(text).first.wait_for(timeout=SLOW)
 
 
@@ -208,7 +208,7 @@ def lift(page: Any) -> None:
 
 
 def pressed(page: Any, least: float = 0.5, tool: str = "") -> None:
-    """The tool so deep that the page says so much force [N]; a drag ends within 3 mm of its aim."""
+    """Press the tool until the page shows this force [N]; a drag ends within 3 mm of its aim."""
     open_tab(page, "Tool")
     for _ in range(60):
         if force_of(page, tool) > least:

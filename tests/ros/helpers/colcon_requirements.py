@@ -17,7 +17,7 @@ COLCON = ("colcon-core", "colcon-cmake", "colcon-ros", "colcon-bash", "colcon-ou
 
 
 def requirements(path: Path) -> list[str]:
-    """One requirement a line."""
+    """Return one requirement per line."""
     project = tomllib.loads(path.read_text())
     (wheels,) = project["tool"]["dynamic-metadata"]
     return [

@@ -1,4 +1,4 @@
-"""Starts loader and contact out of a colcon installation and waits for a state that tells of both.
+"""Starts loader and contact from a colcon installation and waits for a state from both.
 
 python tests/ros/helpers/colcon_run.py INSTALL/avatar_ros        with INSTALL/setup.bash sourced
 """
@@ -60,7 +60,7 @@ def _build(library: Path) -> None:
 
 
 def _state() -> str:
-    """The first state of the contact node in which it has the vademecum."""
+    """Return the first state of the contact node in which it has the vademecum."""
     import rclpy
     from avatar_ros.framework import qos
 

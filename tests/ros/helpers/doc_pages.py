@@ -1,4 +1,4 @@
-"""What the pages in msg_docs/ and the files in params/ say, and what a node offers."""
+"""Statements of the pages in msg_docs/ and the files in params/, and interfaces of a node."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ COMMON_SERVICES = re.compile(
 
 
 def index() -> list[dict[str, str]]:
-    """Rows of the index: interface, page, kind, type, node, direction. A heading names the node."""
+    """Return rows of the index: interface, page, kind, type, node, direction.
+
+    A heading names the node.
+    """
     row = re.compile(
         r"^\| \[`(?P<interface>[^`]+)`\]\((?P<page>[^)]+)\)"
         r" \| `(?P<type>\w+/(?P<kind>\w+)/\w+)` \| (?P<direction>\w+) \|$",
@@ -35,7 +38,7 @@ def index() -> list[dict[str, str]]:
 
 
 def entry(page: str, key: str) -> str:
-    """What follows ``- **key**:`` on a page."""
+    """Return the text after ``- **key**:`` on a page."""
     found = re.search(rf"^- \*\*{key}\*\*: (.+)$", (PAGES / page).read_text(), re.MULTILINE)
     assert found, f"{page} does not say its {key}"
     return found[1]
@@ -46,7 +49,7 @@ def topic(row: dict[str, str]) -> str:
 
 
 def offered(graph: Any, node: str) -> set[tuple[str, str, str]]:
-    """Name, type and direction of what a node has beyond what every managed node has."""
+    """Return name, type and direction of a node's interfaces, without those that all nodes have."""
     offered = set()
     for direction, ask in (
         ("out", graph.get_publisher_names_and_types_by_node),
@@ -65,7 +68,7 @@ def offered(graph: Any, node: str) -> set[tuple[str, str, str]]:
 
 
 def parameter_rows(node: str) -> dict[str, str]:
-    """Name of each documented parameter, and the rest of its row.
+    """Return the name of each documented parameter, and the rest of its row.
 
     A row of ``support.NAME`` or ``missed.LEVEL`` stands for each name in its code spans.
     """
@@ -79,7 +82,7 @@ def parameter_rows(node: str) -> dict[str, str]:
 
 
 def quality_rows(node: str) -> dict[str, str]:
-    """Of a node's topics: each ``qos_overrides`` parameter and the default that its page says."""
+    """Return each ``qos_overrides`` parameter of a node's topics, with the page's default."""
     found = {}
     for row in index():
         said = entry(row["page"], "QoS") if row["node"] == node and row["kind"] == "msg" else ""
@@ -102,7 +105,7 @@ def quality_rows(node: str) -> dict[str, str]:
 
 
 def yaml_parameters(node: str) -> dict[str, Any]:
-    """The parameters in the cell's YAML file, nested names joined by dots."""
+    """Return the parameters in the cell's YAML file, nested names joined by dots."""
     content = yaml.safe_load((ROOT / "params" / "planning_cell.yaml").read_text())
     return _flat(content[node]["ros__parameters"])
 

@@ -1,4 +1,4 @@
-"""As much of the packages launch and launch_ros as our launch file uses, to evaluate it without."""
+"""A stand-in for the packages launch and launch_ros, sufficient to evaluate our launch file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 @dataclass
 class LaunchContext:
-    """What is on the command line, and the values of the arguments."""
+    """Command line, and the values of the arguments."""
 
     argv: list[str] = field(default_factory=list)
     launch_configurations: dict[str, str] = field(default_factory=dict)
@@ -76,7 +76,7 @@ class Node:
 
 
 def modules() -> dict[str, ModuleType]:
-    """For ``sys.modules``."""
+    """Return the modules for ``sys.modules``."""
     contents: dict[str, tuple[type, ...]] = {
         "launch": (LaunchContext, LaunchDescription),
         "launch.actions": (DeclareLaunchArgument, OpaqueFunction),
@@ -93,7 +93,7 @@ def modules() -> dict[str, ModuleType]:
 
 
 def evaluate(description: LaunchDescription, argv: list[str]) -> dict[str, list[Any]]:
-    """The parameters of each node that a command line starts: a file, then values by name."""
+    """Return the parameters of each started node: a file, then values by name."""
     context = LaunchContext(argv, dict(word.split(":=", 1) for word in argv))
     started: dict[str, list[Any]] = {}
     for entity in description.entities:

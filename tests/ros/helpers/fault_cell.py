@@ -1,4 +1,4 @@
-"""A cell to do harm to: its processes, and what the contact node sent meanwhile."""
+"""A cell for fault injection: its processes, and the contact node's messages meanwhile."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ from tests.helpers.slowness import Deadline
 from tests.ros.helpers.steady_tool import SWING
 
 MOST = 5.0  # [N], the limit that the contact node is given
-_ORDINARY_GAP = 2e-3  # between two wrenches, at most [s]
-_CALM = 0.3  # of ordinary palpation, that counts as recovered [s]
-_PATIENCE = 20.0  # for it [s]
+_ORDINARY_GAP = 2e-3  # largest gap between two wrenches [s]
+_CALM = 0.3  # time of ordinary palpation that counts as recovered [s]
+_PATIENCE = 20.0  # time limit for recovery [s]
 
 
 @dataclass
 class Harm:
-    """What a fault came to; times in seconds, of sending.
+    """Effects of a fault; times in seconds, by the sender's clock.
 
-    recovery : from its end to ordinary palpation; infinite where it never came
-    largest : force sent [N]; finite : whether all numbers sent were
-    longest_gap : between two wrenches that were heard while it lasted
-    longest_period : of the loop, as it measured itself
+    recovery : from its end to ordinary palpation; infinite if it never came
+    largest : largest sent force [N]; finite : whether all sent numbers were
+    longest_gap : longest time between two wrenches during the fault
+    longest_period : longest period of the loop, by its own clock
     silent_after : from the tool's end to the last force before its return; NaN if it went on
-    late : what the loop was kept from running meanwhile, in the first tenth of a second
+    late : delay of the loop during the fault's first tenth of a second
     """
 
     name: str
@@ -74,16 +74,16 @@ class Harm:
 
 @dataclass(frozen=True)
 class Silence:
-    """When no tool was there [s]."""
+    """Time without a tool [s]."""
 
     begin: float
     end: float
 
 
 class Ear:
-    """Hears every wrench and every window of statistics, in a thread of its own.
+    """Listener to every wrench and every window of statistics, in a separate thread.
 
-    Times are those of sending: on a crowded machine the ear itself comes late.
+    Times are those of sending: on a busy machine the listener itself comes late.
     """
 
     def __init__(self) -> None:
@@ -127,7 +127,7 @@ class Ear:
         self._thread.join(5.0)
 
     def forces(self, begin: float, end: float) -> tuple[np.ndarray, np.ndarray]:
-        """Times (n,) and forces (n, 3) that came in between."""
+        """Return times (n,) and forces (n, 3) that came in between."""
         chosen = [(at, raw) for at, raw in self.heard if begin <= at <= end]
         found = [deserialize_message(raw, WrenchStamped).wrench.force for _, raw in chosen]
         times = np.array([at for at, _ in chosen])
@@ -135,7 +135,7 @@ class Ear:
 
 
 def _sent(info: dict[str, int]) -> float:
-    """By the monotonic clock [s]."""
+    """Return the time of sending by the monotonic clock [s]."""
     return time.monotonic() - 1e-9 * (time.time_ns() - info["source_timestamp"])
 
 
@@ -202,7 +202,7 @@ class FaultCell:
 
     @contextmanager
     def stopped(self, name: str, seconds: float) -> Iterator[float]:
-        """SIGSTOP for a while; gives when it stood still."""
+        """Stop a process by SIGSTOP for a while; yield the time when it stopped."""
         pid = self.processes[name].pid
         os.kill(pid, signal.SIGSTOP)
         os.waitid(os.P_PID, pid, os.WSTOPPED)
@@ -214,7 +214,7 @@ class FaultCell:
             os.kill(pid, signal.SIGCONT)
 
     def heard_from_tool(self, since: float, patience: float = _PATIENCE) -> float:
-        """When a pose was answered for the first time after a moment."""
+        """Return when a pose was answered for the first time after a moment."""
         answered = (ContactState.STATUS_ENGAGING, ContactState.STATUS_OK)
         passed = Deadline(patience)
         while True:
@@ -225,7 +225,7 @@ class FaultCell:
             time.sleep(0.005)
 
     def wait_until_it_palpates(self, begin: float, patience: float = _PATIENCE) -> float:
-        """How long after ``begin`` ordinary palpation starts [s]; infinity if it does not."""
+        """Return the time from ``begin`` to ordinary palpation [s]; infinity if there is none."""
         passed = Deadline(patience)
         while not passed:
             time.sleep(0.05)
@@ -239,7 +239,7 @@ class FaultCell:
         return float("inf")
 
     def suffer(self, name: str, fault: Callable[[FaultCell], Silence | None]) -> Harm:
-        """Inject a fault while the tool palpates, and see what was sent and when it is over."""
+        """Inject a fault while the tool palpates; return its effects."""
         assert np.isfinite(self.wait_until_it_palpates(time.monotonic(), 120.0)), name
         self.ear.heard.clear()
         self.ear.statuses.clear()
@@ -268,7 +268,7 @@ class FaultCell:
 def _silent_after(
     silence: Silence | None, times: np.ndarray, sizes: np.ndarray
 ) -> tuple[float, float]:
-    """The fields of ``Harm`` of these names; ``sizes`` are of the forces sent at ``times``."""
+    """Return ``silent_after`` and ``late``; ``sizes`` are those of the forces at ``times``."""
     if silence is None:
         return float("nan"), 0.0
     felt = times[(times > silence.begin) & (times < silence.end) & (sizes > 0.0)]

@@ -1,4 +1,4 @@
-"""A tool that publishes one pose from the test's own process, and what it feels."""
+"""A tool that publishes one pose from the test's own process, and the force on it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from avatar_ros.msg import ContactState
 
 
 class Hand:
-    """Publishes one pose again and again, each time with a new stamp; one at a time of a node."""
+    """Publisher of one pose again and again, each time with a new stamp; one per node."""
 
     def __init__(self, probe: Any, position: np.ndarray, frame: str = "organ") -> None:
         node = probe.node
@@ -48,7 +48,7 @@ def wait_for_model(cell: Any, probe: Any) -> None:
 
 
 def felt(probe: Any, hand: Hand, timeout: float = 60.0) -> tuple[ContactState, np.ndarray]:
-    """What a tool in contact feels once its force is engaged, by state and by wrench."""
+    """Return state and wrench of a tool in contact once its force is engaged."""
     wrenches: dict[tuple[int, int], np.ndarray] = {}
     listener = probe.node.create_subscription(
         WrenchStamped,
@@ -59,7 +59,7 @@ def felt(probe: Any, hand: Hand, timeout: float = 60.0) -> tuple[ContactState, n
     engaged: list[tuple[int, int]] = []
 
     def complete(s: ContactState) -> bool:
-        """Not of the first pose: its wrench may have been sent before the force was engaged."""
+        """Exclude the first pose: its wrench may have been sent before the force was engaged."""
         if s.status != ContactState.STATUS_OK or not s.contacts:
             return False
         engaged.append(stamp_of(s))

@@ -1,4 +1,4 @@
-"""Two hosts on one machine: network namespaces with a wire between them, and no shared memory."""
+"""Two hosts on one machine: network namespaces joined by a wire, without shared memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Hosts:
     folder : Path
         Shared memory of ``haptic``.
     environment : dict
-        Of processes that are given none.
+        Default environment of processes.
     hidden : Path, optional
         Folder that is empty on ``haptic``.
     """
@@ -84,7 +84,7 @@ class Hosts:
 def two_hosts(
     folder: Path, environment: dict[str, str], hidden: Path | None = None
 ) -> Iterator[Hosts]:
-    """Skips the test where there is no right to make them."""
+    """Make two hosts, or skip the test without the right to make them."""
     if not _may():
         pytest.skip("no right to make network namespaces")
     found = Hosts(folder, environment, hidden)

@@ -24,9 +24,9 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 class Noted:
-    """Stands for any part of cell or page: notes what it is asked for, and may answer.
+    """Stand-in for any part of cell or page: notes its calls, and may answer.
 
-    calls : names and positional arguments of what was asked; given answers are called with them
+    calls : names and positional arguments of the calls; given answers are called with them
     """
 
     def __init__(self, **answers: Callable[..., Any]) -> None:
@@ -41,19 +41,19 @@ class Noted:
         return ask
 
     def of(self, name: str) -> list[Any]:
-        """First arguments of the calls of a name."""
+        """Return the first arguments of the calls of a name."""
         return [call[1] for call in self.calls if call[0] == name]
 
 
 class AtOnce:
-    """A reader that needs no process."""
+    """Reader that needs no process."""
 
     def read(self, name: str, n_bytes: int, function: Any, *given: Any) -> Any:
         return function(*given)
 
 
 def rows(*tools: tuple[int, float], stamp: int = 5, organ: int = 0) -> np.ndarray:
-    """A period by status and upward force [N] of each tool."""
+    """Return a period by status and upward force [N] of each tool."""
     out = np.zeros(len(tools), ROW)
     out["stamp"], out["tip"], out["sent_fraction"] = stamp, PLACES[: len(tools)], 1.0
     out["status"] = [status for status, _ in tools]
@@ -63,14 +63,14 @@ def rows(*tools: tuple[int, float], stamp: int = 5, organ: int = 0) -> np.ndarra
 
 
 def send(state: SharedToolState, period: np.ndarray) -> None:
-    """A period comes from the contact node."""
+    """Write a period as from the contact node."""
     n = int(state.all["n_recent"][0])
     state.recent[:, n % state.recent.shape[1]] = period
     state.all["n_recent"] = n + 1
 
 
 def periods(number: np.ndarray, n_tools: int = 1, **given: np.ndarray) -> Periods:
-    """Recorded at 1 kHz, of tools that touch nothing unless it is given."""
+    """Return periods recorded at 1 kHz; by default the tools touch nothing."""
     n = len(number)
     plain = {
         "number": number,
@@ -88,7 +88,7 @@ def periods(number: np.ndarray, n_tools: int = 1, **given: np.ndarray) -> Period
 def recording(
     shown: Organ, of: Periods, scene: Scene, moved: np.ndarray | None = None
 ) -> Recording:
-    """With a cloud every twenty periods, displaced by ``moved``, shape (n,), along y [m]."""
+    """Return a recording with a cloud every twenty periods, moved by ``moved`` (n,) along y [m]."""
     chosen = of.number[::20]
     displacement = np.zeros((len(chosen), *shown.vertices.shape), np.float32)
     if moved is not None:
@@ -104,6 +104,6 @@ def image(path: Path, values: np.ndarray, affine: np.ndarray | None = None) -> P
 
 
 def face_area(points: np.ndarray, faces: np.ndarray) -> float:
-    """Of all faces together [m^2]."""
+    """Return the area of all faces together [m^2]."""
     a, b, c = points[faces].swapaxes(0, 1).astype(float)
     return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())

@@ -1,4 +1,4 @@
-"""Parameters of a running node, asked for and set by a probe."""
+"""Parameters of a running node, read and set by a probe."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 
 
 def parameter_names(probe: Any, node: str) -> set[str]:
-    """Those that a node declares itself."""
+    """Return the names that a node declares itself."""
     listed = probe.ask(ListParameters, f"/{node}/list_parameters", ListParameters.Request())
     return set(listed.result.names) - {"use_sim_time", "start_type_description_service"}
 
 
 def parameter_values(probe: Any, node: str, names: Iterable[str]) -> dict[str, Any]:
-    """Values by name."""
+    """Return values by name."""
     request = GetParameters.Request(names=list(names))
     values = probe.ask(GetParameters, f"/{node}/get_parameters", request).values
     return dict(zip(request.names, map(parameter_value_to_python, values), strict=True))
 
 
 def set_parameters(probe: Any, node: str, values: Mapping[str, Any]) -> list[bool]:
-    """Set one after the other; whether each was taken."""
+    """Set one after the other; return whether each was accepted."""
     return [answer.successful for answer in _answers(probe, node, values)]
 
 
 def set_parameter(probe: Any, node: str, name: str, value: Any) -> Any:
-    """The answer: ``successful``, and else a ``reason``."""
+    """Return the answer: ``successful``, and else a ``reason``."""
     return _answers(probe, node, {name: value})[0]
 
 

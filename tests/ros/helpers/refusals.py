@@ -1,5 +1,7 @@
-"""Why a node does not start, found in the test's own process; a node of each kind is started
-as a process elsewhere."""
+"""Reasons why a node does not start, found in the test's own process.
+
+Other tests start a node of each kind as a process.
+"""
 
 from __future__ import annotations
 
@@ -24,10 +26,10 @@ NODES: dict[str, type[ManagedNode]] = {
 
 
 def refusal(name: str, *values: str) -> str:
-    """One line, or empty if the node starts; ``values`` are parameters, ``name:=value``.
+    """Return one line, or "" if the node starts; ``values`` are parameters, ``name:=value``.
 
-    In a domain where nobody else is. The end of a participant waits for what it is being told of
-    others, and where that is under way it waits forever (Fast DDS, issue 6513).
+    The domain is empty. A participant that ends waits for news of others, possibly forever (Fast
+    DDS, issue 6513).
     """
     arguments = ["--ros-args", *(word for value in values for word in ("-p", value))]
     with free_domain() as number:
@@ -37,7 +39,7 @@ def refusal(name: str, *values: str) -> str:
             return _refusal(NODES[name])
         finally:
             rclpy.try_shutdown()
-            gc.collect(1)  # half a node keeps its participant, which others would hear
+            gc.collect(1)  # an unfinished node keeps its participant, which others would hear
 
 
 def _refusal(kind: type[ManagedNode]) -> str:

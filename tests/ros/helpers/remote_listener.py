@@ -1,4 +1,4 @@
-"""Hears a contact node on its own host, and says twenty times a second what it heard.
+"""Listener to a contact node on its own host, which reports twenty times a second.
 
 Run as ``python tests/ros/helpers/remote_listener.py``. Each line is one JSON object: time on the
 monotonic clock [s], number of wrenches, largest force since the last line [N], whether all numbers

@@ -22,7 +22,7 @@ EXECUTABLES = {
 def running(
     node: str, domain: dict[str, str], *values: str, words: Sequence[str] = ()
 ) -> Iterator[Module]:
-    """A node with parameters NAME:=VALUE and other ROS arguments, which has to end well."""
+    """Run a node with parameters NAME:=VALUE and other ROS arguments, which has to end well."""
     words = [*words, *(word for value in values for word in ("-p", value))]
     process = Module(node, ["--ros-args", *words] if words else [], domain)
     try:
@@ -36,7 +36,7 @@ def running(
 def running_cell(
     domain: dict[str, str], library: Path, *values: str, words: Sequence[str] = ()
 ) -> Iterator[dict[str, Module]]:
-    """A loader of liver.h5, and a contact node with parameters and other ROS arguments."""
+    """Run a loader of liver.h5, and a contact node with parameters and other ROS arguments."""
     files = [f"library_dir:={library}", "vademecum:=liver.h5"]
     with ExitStack() as stack:
         loader = stack.enter_context(running("vademecum_loader", domain, *files))

@@ -1,4 +1,4 @@
-"""An organ with a tumour and coordinates of its material; a file of its own, as it is cached."""
+"""An organ with a tumour and coordinates of its material, in a separate file for the cache."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BALL = 0.018  # radius of the tumour [m]
 
 @cached_on_disk
 def sick_organ() -> Vademecum:
-    """A coarse phantom over Poisson's ratio and the contrast of a tumour."""
+    """Build a coarse phantom over Poisson's ratio and the contrast of a tumour."""
     liver = replace(phantom_liver(12e-3), name="sick")
     center = liver.vertices.mean(axis=0) + np.array([0.0, 0.03, 0.0])
     points, faces = ball(360, BALL)

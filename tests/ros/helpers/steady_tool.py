@@ -1,7 +1,7 @@
 """A tool that presses the organ again and again, for as long as it lives.
 
 Run as ``python tests/ros/helpers/steady_tool.py X Y Z NX NY NZ [RATE [SWING]]``: the tip's centre
-touching the surface, the outward normal there, poses per second [Hz], how far it moves [m].
+touching the surface, the outward normal there, poses per second [Hz], amplitude [m].
 """
 
 from __future__ import annotations

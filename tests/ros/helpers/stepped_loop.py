@@ -1,4 +1,4 @@
-"""The contact loop stepped by hand on a clock of its own, without any other process.
+"""The contact loop stepped by hand on its own clock, without any other process.
 
 Tools read serialised poses from a queue of depth one, as the subscription's.
 """
@@ -45,12 +45,12 @@ def pose(
 
 
 class Queue:
-    """A subscription of depth one, and a publisher."""
+    """Subscription of depth one, and publisher."""
 
     def __init__(self) -> None:
         self.handle = self
         self.waiting: bytes | None = None
-        self.number = 0  # of the message that is taken next, as its publisher counts
+        self.number = 0  # sequence number of the message that is taken next
         self.sent: list[bytes] = []
 
     def take_message(self, kind: type, raw: bool) -> tuple[bytes, dict[str, int]] | None:
@@ -64,7 +64,7 @@ class Queue:
 
 
 class SteppedLoop:
-    """A loop on a clock of its own; ``now`` is in seconds since it began."""
+    """Loop on a clock of its own; ``now`` is in seconds since its begin."""
 
     def __init__(self, organ: Any, context: Any, timeout: float, n_tools: int = 1) -> None:
         names = tuple(f"tool{i}" for i in range(n_tools))
@@ -92,7 +92,7 @@ class SteppedLoop:
         self.loop._used = self.loop.active  # at once, not faded in
 
     def step(self, *messages: bytes | None, after: float = 1e-3) -> tuple[int, np.ndarray]:
-        """Status and force of the first tool in the period after some messages."""
+        """Return status and force of the first tool in the period after some messages."""
         for queue, message in zip(self.poses, messages, strict=False):
             queue.waiting = message if message is not None else queue.waiting
         self.now += after
@@ -102,7 +102,7 @@ class SteppedLoop:
         return state.status, np.array([force.x, force.y, force.z])
 
     def press(self, touch: tuple[np.ndarray, np.ndarray], depth: float) -> np.ndarray:
-        """Come in from the surface, 1 mm a period; the tip there."""
+        """Come in from the surface, 1 mm per period; return the tip there."""
         for d in np.append(np.arange(-6e-3, depth, 1e-3), depth):
             status, _ = self.step(pose(touch[0] - d * touch[1]))
             assert status == OK
@@ -113,7 +113,7 @@ class SteppedLoop:
 def stepped_loops(
     organ: Any, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[..., SteppedLoop]]:
-    """Makes loops of an organ; the last one sets the clock of all."""
+    """Make loops of an organ; the last one sets the clock of all."""
     context = rclpy.Context()
     context.init()
     made: list[SteppedLoop] = []

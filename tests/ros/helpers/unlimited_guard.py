@@ -1,4 +1,4 @@
-"""A force guard without limits, for tests of what comes before it."""
+"""A force guard without limits, for tests of the steps before it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from avatar_core.haptics.force_guard import DEVICES
 
 
 class UnlimitedGuard:
-    """Takes the place of ForceGuard."""
+    """Replacement for ForceGuard."""
 
     def __init__(self) -> None:
         self.limits, self.sent_fraction, self.limited = DEVICES["sigma"], 1.0, False

@@ -1,4 +1,4 @@
-"""The force that is sent, fault by fault, through the loop and without any other process.
+"""The sent force, fault by fault, through the loop and without any other process.
 
 The loop is stepped by hand on a clock that the test sets, 1 ms a period.
 """
@@ -37,7 +37,7 @@ Fault = Callable[[Any, np.ndarray], Any]
 
 
 class Cell:
-    """A bench whose force goes through a guard; the tool is held 3 mm deep, engaged."""
+    """Bench whose force goes through a guard; the tool is held 3 mm deep, engaged."""
 
     def __init__(self, bench: SteppedLoop, touch: Any, safety: Safety = SAFETY) -> None:
         self.bench, self.loop, self.tool = bench, bench.loop, bench.tools[0]
@@ -50,19 +50,19 @@ class Cell:
         assert status == OK and np.linalg.norm(self.force) > 1.0
 
     def hold(self, n: int, message: Callable[[], bytes | None] | None = None) -> np.ndarray:
-        """Status and force of some periods with the same pose, shape (n, 4)."""
+        """Return status and force of some periods with the same pose, shape (n, 4)."""
         found = [
             self.bench.step(pose(self.tip) if message is None else message()) for _ in range(n)
         ]
         return np.array([[status, *force] for status, force in found])
 
     def counts(self, *publishers: str) -> None:
-        """The node counts these publishers, by their identifiers."""
+        """Count these publishers, by their identifiers, as the node does."""
         named = {publisher: f"/{publisher}" for publisher in publishers}
         self.tool.note_senders(named, round(1e9 * self.bench.now) + 1)
 
     def refuses(self) -> bool:
-        """Whether the poses of some periods are those of several publishers."""
+        """Return whether poses of some periods are refused as those of several publishers."""
         several = self.hold(5)[:, 0] == ContactState.STATUS_SEVERAL_PUBLISHERS
         assert several.all() or not several.any()
         return bool(several[0])
@@ -74,7 +74,7 @@ def cell(bench: Any, touch: tuple[np.ndarray, np.ndarray]) -> Iterator[Cell]:
 
 
 def silence(cell: Cell) -> tuple[int, np.ndarray]:
-    """Poses cease; what is sent from the timeout on."""
+    """Stop the poses; return the force that is sent from the timeout on."""
     before = cell.hold(20, lambda: None)
     np.testing.assert_allclose(before[:, 1:], np.tile(cell.force, (20, 1)), rtol=1e-9)
     return ContactState.STATUS_STALE_POSE, cell.hold(12, lambda: None)
@@ -92,13 +92,13 @@ def foreign(cell: Cell) -> tuple[int, np.ndarray]:
 
 def leap(cell: Cell) -> tuple[int, np.ndarray]:
     first = cell.hold(1, lambda: pose(cell.tip + np.array([0.0, 0.025, 0.0])))
-    back = cell.hold(1)  # which is a leap, too
+    back = cell.hold(1)  # the return is also a leap
     assert back[0, 0] == ContactState.STATUS_LEAP
     return ContactState.STATUS_LEAP, np.vstack([first, back, cell.hold(10)])
 
 
 def second_publisher(cell: Cell) -> tuple[int, np.ndarray]:
-    """Each counts its own messages; the second goes away, as the node finds."""
+    """Add a second publisher with its own count, which then leaves."""
     cell.bench.poses[0].number -= 1000
     first = cell.hold(1)
     cell.bench.poses[0].number += 1000
@@ -108,7 +108,7 @@ def second_publisher(cell: Cell) -> tuple[int, np.ndarray]:
 
 
 def standstill(cell: Cell) -> tuple[int, np.ndarray]:
-    """The whole process is stopped for 2 s, and wakes up to a new pose."""
+    """Stop the whole process for 2 s, until a new pose."""
     status, force = cell.bench.step(pose(cell.tip), after=2.0)
     return ContactState.STATUS_STALE_POSE, np.vstack([[status, *force], cell.hold(11)])
 
@@ -122,7 +122,7 @@ def lost(cell: Cell) -> tuple[int, np.ndarray]:
 
 
 def heard(cell: Cell) -> ToolDevice:
-    """The device of the cell's tool, which said that it is ready."""
+    """Return the device of the cell's tool, which reported that it is ready."""
     device = ToolDevice(cell.tool, (), Time)
     device.hear(READY)
     return device
@@ -145,7 +145,7 @@ def unhomed(cell: Cell) -> tuple[int, np.ndarray]:
 
 
 def unheard(cell: Cell) -> tuple[int, np.ndarray]:
-    """Its driver goes away, but its poses do not."""
+    """Remove its driver, but not its poses."""
     device = heard(cell)
     device.subscription = SimpleNamespace(get_publisher_count=lambda: 0)
     device.attend()
@@ -165,7 +165,7 @@ def test_a_fault_ends_the_force_within_10_ms_and_it_comes_back_softly(
     before = cell.tool.faults.copy()
     status, found = fault(cell)
     sizes = np.linalg.norm(found[:, 1:], axis=1)
-    held = np.linalg.norm(cell.force[None], axis=1)  # by the same sums, which round alike
+    held = np.linalg.norm(cell.force[None], axis=1)  # by the same sums, with equal rounding
     assert found[0, 0] == status
     assert (np.diff(sizes) <= 1e-12).all() and sizes[0] <= held[0]
     assert not sizes[10:].any()
@@ -215,7 +215,7 @@ def test_a_tool_that_starts_again_while_another_joins_is_not_taken_for_it(cell: 
 
 @pytest.mark.parametrize("sends", [False, True])
 def test_another_publisher_is_found_by_its_identifier(cell: Cell, sends: bool) -> None:
-    """However seldom it sends; one that was killed counts again when it sends again."""
+    """However rarely it sends; a killed one counts again when it sends again."""
     cell.counts("driver")
     cell.counts("driver", "forgotten")
     assert cell.refuses()
@@ -264,7 +264,7 @@ def test_large_forces_are_limited_and_the_state_says_how_much(
 
 
 def test_a_swap_goes_from_old_to_new_within_the_slew(cell: Cell, organ: Any) -> None:
-    """To a model of half the modes in another organ's name, while the tool is held deep."""
+    """From an organ to half the modes under another organ's name, with the tool held deep."""
     limits = ForceLimits(20.0, 30.0)
     cell.loop.settings = replace(cell.loop.settings, safety=replace(SAFETY, limits=limits))
     data = prepare(organ, (Tip("sphere", 5e-3),), modes=3, cloud="off")
@@ -314,7 +314,7 @@ def test_a_loop_that_breaks_lets_go(cell: Cell, monkeypatch: pytest.MonkeyPatch)
 def test_passivity_is_watched_or_kept(
     bench: Any, touch: tuple[np.ndarray, np.ndarray], mode: str
 ) -> None:
-    """A tool that goes in and out fast, its force a period late: control takes some of it."""
+    """A tool goes in and out fast, its force a period late: control takes some of it."""
 
     def felt(one: Cell) -> np.ndarray:
         ways = 2e-3 * np.sin(2 * math.pi * 10 * np.arange(300) * 1e-3)

@@ -52,7 +52,7 @@ def test_a_jaw_is_closed_below_one_position_and_open_above_another() -> None:
         False, False, True, True, True, False, False,
     ]  # fmt: skip
     assert driver.says(-0.2)
-    assert driver.says(math.nan) and driver.says()  # what says nothing changes nothing
+    assert driver.says(math.nan) and driver.says()  # an empty message changes nothing
 
 
 def test_thresholds_that_cross_are_refused() -> None:

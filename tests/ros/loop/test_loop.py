@@ -1,4 +1,4 @@
-"""The loop itself, period by period: how one model replaces another, and what a turn does."""
+"""The loop period by period: exchange of models, and effect of a turn."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ SETTINGS = LoopSettings(
 
 
 class Outlet:
-    """Keeps what is published."""
+    """Outlet that keeps published messages."""
 
     def __init__(self) -> None:
         self.handle = self
@@ -59,7 +59,7 @@ class Outlet:
 
 
 class HeldTool:
-    """A tool with a pose in every period."""
+    """Tool with a pose in every period."""
 
     def __init__(self, tip: np.ndarray) -> None:
         self.tip, self.orientation = tip.copy(), np.array([0.0, 0.0, 0.0, 1.0])
@@ -70,7 +70,7 @@ class HeldTool:
 
     @property
     def fault(self) -> int:
-        """Its device takes every force."""
+        """Return that its device takes every force."""
         return self.status
 
     def take(
@@ -87,7 +87,7 @@ class HeldTool:
 
 
 class Bench:
-    """A loop that is stepped by hand."""
+    """Loop that is stepped by hand."""
 
     def __init__(self, organ: Any, tip: np.ndarray, context: Any) -> None:
         self.organ = organ
@@ -102,7 +102,7 @@ class Bench:
         self.loop.active = ActiveModel(identity, data, SETTINGS)
 
     def step(self, n: int = 1) -> np.ndarray:
-        """Force and torque of the last periods, shape (n, 6)."""
+        """Return force and torque of the last periods, shape (n, 6)."""
         for _ in range(n):
             self.loop._step()
         wrenches = [
@@ -118,7 +118,7 @@ class Bench:
         self.step(5)
 
     def clouds(self, n: int) -> np.ndarray:
-        """Points of the last clouds, shape (n, n_points, 6)."""
+        """Return points of the last clouds, shape (n, n_points, 6)."""
         messages = [deserialize_message(raw, PointCloud2) for raw in self.cloud.sent[-n:]]
         return np.array([np.frombuffer(m.data, np.float32).reshape(-1, 6) for m in messages])
 
@@ -137,7 +137,7 @@ def bench(organ: Any, touch: tuple[np.ndarray, np.ndarray]) -> Iterator[Bench]:
 
 @pytest.fixture
 def across(touch: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """A unit vector along the surface."""
+    """Return a unit vector along the surface."""
     across = np.cross(touch[1], [0.0, 0.0, 1.0])
     return across / np.linalg.norm(across)
 
@@ -163,7 +163,7 @@ def test_without_a_model_the_loop_steps_seldom_but_sees_every_stream(
 
 @pytest.mark.parametrize("reason", ["a model", "a tool", "the end"])
 def test_alone_it_sleeps_until_it_is_woken(bench: Bench, reason: str) -> None:
-    """However long that would be; the period that is cut short is neither late nor early."""
+    """It may sleep long; the shortened period is neither late nor early."""
     loop, tool = bench.loop, bench.tool
     tool.connected = False
     loop._step()
@@ -200,7 +200,7 @@ def test_the_force_moves_linearly_from_one_selection_of_effects_to_the_next(
     assert apart > 0.05
     changes = np.linalg.norm(np.diff(felt[:, :3], axis=0), axis=1)
     print(f"\nfriction to bare: {apart:.4f} N apart, largest change a period {changes.max():.6f} N")
-    # Nothing moves and nothing relaxes: exactly linear, but for rounding.
+    # nothing moves and nothing relaxes: exactly linear, except for rounding
     np.testing.assert_allclose(changes[:N_BLEND], apart / N_BLEND, rtol=1e-6)
     np.testing.assert_allclose(changes[N_BLEND:], 0.0, atol=1e-12)
     part = np.linspace(0.0, 1.0, N_BLEND + 1)[:, None]

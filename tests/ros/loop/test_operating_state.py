@@ -1,4 +1,4 @@
-"""What a device says of itself and what it is asked for, without any process."""
+"""Reports of a device and commands to it, without any process."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NOTHING, NOT_ENABLED, NOT_HOMED = (
 
 
 class Driver:
-    """The other end of both topics, and a tool whose poses are sound."""
+    """The other end of both topics, and a tool whose poses are valid."""
 
     def __init__(self, asked: str) -> None:
         self.there, self.asked_for = 1, list[str]()
@@ -42,7 +42,7 @@ class Driver:
         self.asked_for.append(message.string)
 
     def says(self, state: str, homed: bool = False, busy: bool = False) -> int:
-        """The status of the device after it said so."""
+        """Return the status of the device after this report."""
         self.device.hear(OperatingState(state=state, is_homed=homed, is_busy=busy))
         for _ in range(3):
             self.device.attend()

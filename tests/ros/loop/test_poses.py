@@ -1,4 +1,4 @@
-"""Poses as no driver should send them, through the parser and the loop, without any other process.
+"""Faulty poses, through the parser and the loop, without any other process.
 
 The loop is stepped by hand on a clock that the test sets; tools read serialised poses from a queue
 of depth one, as the subscription's.
@@ -28,7 +28,7 @@ UNKNOWN_FRAME = int(ContactState.STATUS_UNKNOWN_FRAME)
 
 @pytest.mark.parametrize("depth", [0.0, 8e-3])
 def test_a_broken_pose_costs_one_period(bench: Any, touch: Any, depth: float) -> None:
-    """Even where a tip is deeper than any contact may begin: 7 mm of its centre, after that."""
+    """Even if a tip is deeper than any contact may begin: 7 mm for its centre."""
     cell = bench()
     tip = cell.press(touch, depth)
     before = cell.step(pose(tip))[1]
@@ -46,7 +46,7 @@ def test_a_broken_pose_costs_one_period(bench: Any, touch: Any, depth: float) ->
         status, force = cell.step(message)
         assert status in (INVALID, UNKNOWN_FRAME), name
         assert not force.any(), name
-        if status == UNKNOWN_FRAME:  # its header was cut; who it was is not known
+        if status == UNKNOWN_FRAME:  # its header was cut; its sender is not known
             cell.press(touch, depth)
         status, after = cell.step(pose(tip))
         assert status == OK, name
@@ -54,7 +54,7 @@ def test_a_broken_pose_costs_one_period(bench: Any, touch: Any, depth: float) ->
 
 
 def test_a_clock_that_goes_back_is_only_told(bench: Any, touch: Any) -> None:
-    """Poses count by when they come; the answer carries their stamp, whatever it says."""
+    """Poses count by their arrival; the answer carries their stamp, whatever it is."""
     cell = bench()
     tip = cell.press(touch, 0.0)
     before = cell.step(pose(tip))[1]
@@ -71,7 +71,7 @@ def test_a_clock_that_goes_back_is_only_told(bench: Any, touch: Any) -> None:
 
 
 def test_the_age_is_that_of_the_pose_that_was_answered(bench: Any, touch: Any) -> None:
-    """A first tool without a pose was 54 years old."""
+    """A first tool without a pose must not give an age of 54 years."""
     cell = bench(n_tools=2)
     for _ in range(5):
         cell.now += 1e-3
@@ -82,7 +82,7 @@ def test_the_age_is_that_of_the_pose_that_was_answered(bench: Any, touch: Any) -
 
 
 def test_5_khz_and_10_hz(bench: Any, touch: Any) -> None:
-    """Of five poses in a period the last counts; between two in 100 periods the last holds."""
+    """The last of five poses in a period counts; between two in 100 periods the last holds."""
     path = [touch[0] - 1e-3 * math.sin(k / 300) * touch[1] for k in range(3000)]
     cell = bench(timeout=0.5)
     cell.press(touch, 0.0)
@@ -109,7 +109,7 @@ def test_5_khz_and_10_hz(bench: Any, touch: Any) -> None:
 def test_a_slow_stream_is_called_so_before_its_second_pose(
     bench: Any, touch: Any, hertz: int
 ) -> None:
-    """A first pose is answered; that none follows it in time is the rate, not an end."""
+    """A first pose is answered; a late second one is a slow rate, not an end."""
     cell = bench(timeout=0.02)
     cell.step(None, after=60.0)  # that nobody was there
     counter = FaultCounter(cell.tools)
@@ -182,7 +182,7 @@ def test_a_tool_that_joins_an_idle_loop_is_not_slow(bench: Any, touch: Any, hert
 def test_what_came_last_says_why_there_is_no_force(
     bench: Any, touch: Any, hertz: int, fault: str
 ) -> None:
-    """Between two refused poses as well, however slowly they come; and after the first."""
+    """Also between two refused poses, however slow, and after the first."""
     cell = bench(timeout=0.02)
     spoilt, expected = {
         "frame": (pose(touch[0], frame="world"), UNKNOWN_FRAME),
@@ -230,7 +230,7 @@ def test_a_stream_is_judged_by_when_it_comes(bench: Any, touch: Any, hertz: int,
 
 
 def test_a_tip_that_stays_out_of_range_is_a_fault_that_lasts(bench: Any, touch: Any) -> None:
-    """Until it has left the organ; its poses are sound all the time."""
+    """It lasts until the tip has left the organ; its poses are valid all the time."""
     cell = bench()
     cell.press(touch, 0.0)
     cell.step(None, after=60.0)
@@ -247,7 +247,7 @@ def test_a_tip_that_stays_out_of_range_is_a_fault_that_lasts(bench: Any, touch: 
 
 @pytest.mark.parametrize(("depth", "expected"), [(0.0, OK), (10e-3, BARRED)])
 def test_a_minutes_silence(bench: Any, touch: Any, depth: float, expected: int) -> None:
-    """Who comes back where a contact may begin has force again; deeper, it has to come out."""
+    """A tip that returns where a contact may begin has force again; a deeper one must come out."""
     cell = bench()
     tip = cell.press(touch, depth)
     before = cell.step(pose(tip))[1]

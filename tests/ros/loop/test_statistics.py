@@ -1,4 +1,4 @@
-"""What the contact node says of its loop's times are their percentiles, by nearest rank."""
+"""Times that the contact node reports are percentiles by nearest rank."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every place that lists the status codes lists those of ``avatar_core.contact.status``."""
+"""Every list of status codes agrees with ``avatar_core.contact.status``."""
 
 from __future__ import annotations
 

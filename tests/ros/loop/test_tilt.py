@@ -1,4 +1,4 @@
-"""The direction of a tool's axis, from its pose to the torque on it."""
+"""Direction of a tool's axis, from its pose to the torque on it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PUNCH = Tip("flat", 4e-3)
 
 
 def punch_bench(bench: Any, organ: Any) -> SteppedLoop:
-    """A loop whose tool is a punch with its shaft along +x of its pose."""
+    """Return a loop whose tool is a punch with its shaft along +x of its pose."""
     made: SteppedLoop = bench(20e-3)
     data = prepare(organ, (PUNCH,), cloud="off", effects=(Tilt((1.0, 0.0, 0.0)),))
     made.loop.active = made.loop._used = ActiveModel("a", data, made.settings)
@@ -39,7 +39,7 @@ def torque(bench: SteppedLoop) -> np.ndarray:
 
 
 def leaning(normal: np.ndarray, angle: float) -> Rotation:
-    """A pose whose x axis leans off a normal."""
+    """Return a pose whose x axis is tilted off a normal."""
     aside = np.cross(normal, [0.3, 0.5, 0.8])
     axis = np.cos(angle) * normal + np.sin(angle) * aside / np.linalg.norm(aside)
     turn, _ = Rotation.align_vectors(axis[None], [[1.0, 0.0, 0.0]])

@@ -27,7 +27,7 @@ from avatar_ros.msg import ContactState, VademecumInfo
 from tests.core.bags.bag_files import STORE
 from tests.helpers.slowness import Deadline
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds an organ and starts nodes
 
 SECONDS = 4  # one touch
 _BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -41,7 +41,7 @@ TOPICS = {
 
 
 class Recorder:
-    """Takes messages as they come from the middleware: bytes, with the time of their receipt."""
+    """Recorder of messages as the middleware gives them: bytes, with their time of receipt."""
 
     def __init__(self, node: Any) -> None:
         group = PolledSubscriptions()
@@ -72,7 +72,7 @@ class Recorder:
 
 @pytest.fixture(scope="module")
 def recorder(cell: Any, lasting_probe: Any, library: Path, own_domain: dict[str, str]) -> Recorder:
-    """What one touch of the scripted tool gave."""
+    """Record one touch of the scripted tool."""
     recorder = Recorder(lasting_probe.node)
     lasting_probe.next(ContactState, "contact_state", qos.state(1), lambda s: s.vademecum_id)
     arguments = [str(library / "liver.h5"), "--seconds", str(SECONDS)]
@@ -109,6 +109,6 @@ def test_a_bag_of_a_cell_is_replayed(
     assert bag.vademecum_ids == (organ.id,) and not bag.notes
     assert path.answers == ("states" if states else "wrenches")
     assert size.max() > 0.1
-    # On a busy machine, the force guard may alter forces all the time.
+    # on a busy machine, the force guard may alter forces all the time
     assert known.sum() > 200 if states else found.known.any()
     assert found.difference(path.recording) <= 1e-9

@@ -1,4 +1,4 @@
-"""The service that finds the material from touches: its answers, and what it refuses."""
+"""The service that finds the material from touches: answers and refusals."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from tests.helpers.soft_organ import organ_on_springs
 from tests.helpers.touches import felt, path_over, recording_of
 from tests.ros.helpers.running import running
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds an organ and starts nodes
 
 SUPPORT = "support.bare_area"
 TRUE = {"young": 6e3, SUPPORT: 3e6}
 N_TOUCHES = 4
-IMPORTED = 4.0  # processor time after which touches are followed [s]
+IMPORTED = 4.0  # processor time until touches are followed [s]
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def ask(loader: Module, probe: Any) -> Callable[..., Any]:
 
 
 def test_it_finds_the_values_of_the_organ_that_was_loaded(ask: Callable[..., Any]) -> None:
-    """And says how sure they are, while the loader goes on to serve."""
+    """It also states the uncertainty, while the loader goes on to serve."""
     answer = ask(recording="push.h5")
     assert answer.success, answer.message
     assert answer.explained and answer.message.startswith("the fit is good")
@@ -87,7 +87,7 @@ def test_what_is_known_before_counts(ask: Callable[..., Any]) -> None:
 
 @pytest.mark.long
 def test_a_model_that_cannot_be_is_called_so(ask: Callable[..., Any], library: Path) -> None:
-    """Forces that grow fourfold from one touch to the next are of no organ like this."""
+    """No such organ has forces that grow fourfold from one touch to the next."""
     found = load_recording(library / "push.h5")
     force = np.array(found.periods.force)
     force[: len(force) // 2] *= 4.0

@@ -1,4 +1,4 @@
-"""Loader and contact node as real processes: what a tool feels, and what is refused."""
+"""Loader and contact node as real processes: force on a tool, and refusals."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def probe(lasting_probe: Any) -> Any:
 
 
 def _status(probe: Any, status: int, hand: Hand) -> ContactState:
-    """The first such state that answers a pose of the hand, none of one before it."""
+    """Return the first such state that answers a pose of this hand, not an earlier one."""
 
     def wanted(state: ContactState) -> bool:
         return state.status == status and stamp_of(state) in hand.stamps
@@ -60,7 +60,7 @@ def test_a_touch_is_felt(cell: Any, probe: Any, touch: tuple[np.ndarray, np.ndar
     assert wrench.header.frame_id == "organ"
     assert stamp_of(wrench) in hand.stamps
     force = force_of(wrench)
-    # The organ pushes the tool out: along the normal, up to what its curved surface tilts.
+    # The organ pushes the tool out: along the normal, up to the tilt of its curved surface.
     assert force @ normal > 0.8 * np.linalg.norm(force)
 
 
@@ -82,7 +82,7 @@ def test_the_cloud_is_the_deformed_surface(
     hand = Hand(probe, touch[0])
 
     def deformed(cloud: PointCloud2) -> bool:
-        """By this hand: what an earlier one pressed may still be under way."""
+        """Return whether this hand deforms it: an earlier push may still be on its way."""
         of_hand = stamp_of(cloud) in hand.stamps
         return of_hand and bool(np.abs(_points(cloud)[:, 3:]).max() > 1e-3)
 
@@ -90,7 +90,7 @@ def test_the_cloud_is_the_deformed_surface(
     assert cloud.header.frame_id == "organ"
     assert [field.name for field in cloud.fields] == ["x", "y", "z", "dx", "dy", "dz"]
     points = _points(cloud)
-    # float32 positions of 0.1 m are good to 1e-8 m; two roundings.
+    # float32 positions of 0.1 m are exact to 1e-8 m; two roundings
     np.testing.assert_allclose(points[:, :3] - points[:, 3:], organ.surface_vertices, atol=5e-8)
 
 
@@ -134,8 +134,10 @@ def test_a_bad_pose_gives_no_force(
 def test_a_second_publisher_of_poses_ends_the_force(
     cell: Any, probe: Any, touch: tuple[np.ndarray, np.ndarray], hertz: int
 ) -> None:
-    """However seldom it sends, and though the first stands still while it joins; none of its poses,
-    which are 6 mm deeper, is answered."""
+    """The force ends for any rate of the second, and while the first pauses.
+
+    The second's poses are 6 mm deeper; none is answered.
+    """
     wait_for_model(cell, probe)
     hand = Hand(probe, touch[0])
     _, force = felt(probe, hand)
@@ -175,7 +177,7 @@ def test_another_cell_in_the_domain_is_an_error_and_its_organ_is_not_taken(
     wait_for_model(cell, probe)
 
     def said(level: bytes) -> str:
-        """Levels and messages about other cells in the diagnostics."""
+        """Return levels and messages about other cells in the diagnostics."""
         found: list[DiagnosticStatus] = []
 
         def is_said(array: DiagnosticArray) -> bool:
@@ -237,7 +239,7 @@ def test_a_pose_that_stops_coming_is_stale(
 
 
 def processor_time(pid: int) -> float:
-    """Of a process until now [s]."""
+    """Return the processor time of a process until now [s]."""
     said = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(said[11]) + int(said[12])) / os.sysconf("SC_CLK_TCK")
 
@@ -257,7 +259,7 @@ def test_the_loop_keeps_its_rate_without_poses(cell: Any, probe: Any) -> None:
         used = processor_time(cell["contact"].pid) - used
         work = used / ((time.monotonic() - began) * windows[-1].rate)
         windows.clear()
-        slept = bare_loop.periods(1.2, work)  # of a loop that works as much, meanwhile
+        slept = bare_loop.periods(1.2, work)  # of a loop with as much work, meanwhile
         # The design rate is 1000 Hz; the bound only tells a working loop from a broken one, since
         # these tests share their cores with whatever else runs: of the time that the machine left
         # to the bare loop. `avatar bench cell` measures it.

@@ -1,4 +1,4 @@
-"""The package as colcon builds it, from a workspace, without pip's installation of it."""
+"""The package as colcon builds it, from a workspace, without pip's installation."""
 
 from __future__ import annotations
 

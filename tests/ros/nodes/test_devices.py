@@ -1,4 +1,4 @@
-"""Drivers of haptic devices: the wrench as they take it, their files, and one that stands in."""
+"""Drivers of haptic devices: form of the wrench, their files, and a stand-in."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from tests.ros.helpers.refusals import refusal
 from tests.ros.helpers.running import running_cell
 from tests.ros.helpers.stepped_loop import pose
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds organs and starts nodes
 
 DEVICES = PARAMS / "devices"
 CRTK = QoSProfile(depth=10)  # of crtk_python_client: reliable, the last ten
-# Of what cisst-ros publishes when it changes.
+# published by cisst-ros when it changes
 LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -41,7 +41,7 @@ def wrench(raw: bytes) -> tuple[np.ndarray, np.ndarray]:
 def test_a_wrench_comes_as_crtk_names_it(
     bench: Any, touch: tuple[np.ndarray, np.ndarray], kind: str
 ) -> None:
-    """Of a device whose base is turned and shifted, held askew: one force, said in three ways."""
+    """A device with a turned and shifted base, tilted: one force in three forms."""
     frame, shift = Rotation.from_euler("xyz", [0.4, -1.0, 2.0]), np.array([0.3, -0.1, 0.2])
     held = Rotation.from_euler("xyz", [1.0, 0.3, -0.7])  # in the device's frame
     found = {}
@@ -85,8 +85,8 @@ def test_a_driver_feels_the_organ_by_its_file(
 ) -> None:
     """Started by the lines of msg_docs/guides/devices.md, with poses at 500 Hz as crtk's clients.
 
-    It feels nothing before it says that it is enabled and homed, and nothing any more when it is
-    paused or in fault.
+    There is no force before it reports that it is enabled and homed, nor once it is paused or in
+    fault.
     """
     frame = {"arm": "base", "omega": "omega_base", "MTML": "MTML_base"}[name]
     own = "body/servo_cf" if name == "MTML" else "servo_cf"
@@ -146,7 +146,7 @@ def test_a_driver_feels_the_organ_by_its_file(
 def test_beside_a_device_a_tool_of_software_speaks_in_the_organs_frame(
     own_domain: dict[str, str], library: Path, probe: Any, touch: tuple[np.ndarray, np.ndarray]
 ) -> None:
-    """As a planning page beside a Touch does, whose device has not been enabled yet."""
+    """A planning page runs beside a Touch whose device has not been enabled yet."""
     words = ["--params-file", str(DEVICES / "touch.yaml"), *PATIENT[1:]]
     elsewhere = "tool_transform:=[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]"
     values = ("tools:=[stylus, page]", "software_tools:=page", elsewhere)

@@ -1,4 +1,4 @@
-"""Harm done to a cell of real processes while a tool palpates at 1 kHz; a row for each fault.
+"""Faults of real processes while a tool palpates at 1 kHz; a row for each fault.
 
 `pytest -m long tests/ros/nodes/test_faults.py -s` prints the table.
 """
@@ -26,7 +26,7 @@ from tests.ros.helpers.parameters import set_parameters
 pytestmark = [pytest.mark.long, pytest.mark.timing]
 
 STOPPED = 2.0  # [s]
-RECOVERY = 1.0  # on a machine that nothing else uses [s]
+RECOVERY = 1.0  # on an idle machine [s]
 JOINING = 30  # processes, two at a time
 SWAPS = 150
 JOIN = """
@@ -50,7 +50,7 @@ def cell(
 
 @pytest.fixture(autouse=True)
 def nothing_is_lost(library: Path, folder: Path) -> Iterator[None]:
-    """The files of both libraries are those of before, to the bit."""
+    """Check that the files of both libraries are unchanged, to the bit."""
     before = _digests(library) | _digests(folder)
     yield
     after = _digests(library) | _digests(folder)
@@ -67,7 +67,7 @@ def _digests(place: Path) -> dict[str, str]:
 
 @pytest.fixture
 def tool(cell: FaultCell) -> Iterator[FaultCell]:
-    """A cell whose tool palpates."""
+    """Run a cell whose tool palpates."""
     if "tool" not in cell.processes:
         cell.start("tool")
     for name in ("loader", "contact", "patients", "viewer"):
@@ -90,7 +90,7 @@ def accept(harm: Harm) -> None:
 def test_another_process_is_killed(tool: FaultCell, name: str) -> None:
     harm = tool.suffer(f"kill -9 of {name}", lambda cell: cell.end(name))
     accept(harm)
-    # What held the loop back for so long held back the tool, too.
+    # a delay of the loop that long also delayed the tool
     assert harm.recovery == 0.0 or harm.longest_period > STALE
 
 
@@ -100,7 +100,7 @@ def test_the_tool_is_killed(tool: FaultCell) -> None:
         begin = time.monotonic()
         time.sleep(1.0)
         silent = time.monotonic()
-        cell.start("tool")  # takes a second or so to send its first pose
+        cell.start("tool")  # takes about a second to send its first pose
         return Silence(begin, cell.heard_from_tool(silent))
 
     harm = tool.suffer("kill -9 of the tool", kill)
@@ -109,7 +109,7 @@ def test_the_tool_is_killed(tool: FaultCell) -> None:
 
 
 def test_the_contact_node_is_killed(tool: FaultCell) -> None:
-    """Nobody can send a zero then; once it is back, it goes on softly with what was loaded."""
+    """Nobody can send a zero then; once restarted, it goes on softly with the loaded organ."""
 
     def kill(cell: FaultCell) -> None:
         identity = cell.ear.statuses[-1][2] if cell.ear.statuses else ""
@@ -163,7 +163,7 @@ def test_processes_join(tool: FaultCell, own_domain: dict[str, str]) -> None:
 
     harm = tool.suffer(f"{JOINING} processes join", join)
     accept(harm)
-    # tells a loop that goes on from one that waits a third of a second for a look at them
+    # distinguishes a loop that goes on from one that waits a third of a second per process
     assert harm.longest_period < 0.2
 
 
@@ -184,7 +184,7 @@ def test_broken_vademecums_are_offered(tool: FaultCell, lasting_probe: Probe) ->
 
 
 def test_vademecums_are_swapped_all_the_time(tool: FaultCell, lasting_probe: Probe) -> None:
-    """Between the same organ under two names: what is felt stays the same."""
+    """The same organ under two names: the force stays the same."""
 
     def swap(cell: FaultCell) -> None:
         client = lasting_probe.client(LoadVademecum, "load_vademecum")

@@ -1,4 +1,4 @@
-"""The frames of the cell as tf2's listener hears them, and the messages of others that we build."""
+"""Frames of the cell as tf2's listener hears them, and our builds of foreign messages."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from avatar_ros.msg import ContactState
 from tests.ros.helpers.refusals import refusal
 from tests.ros.helpers.running import running
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds an organ and starts nodes
 
 LISTENER = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # tf2's of tf_static
-# Of the originals, RIHS01 (REP 2016).
+# type hashes of the originals, RIHS01 (REP 2016)
 HASHES = {
     OperatingState: ("5cc57eea589b217fe5194bf2735b91d4a7f2dd5ac1245ae657f7ea7590c2c80e"),
     StringStamped: ("83efb802e6596e03f69ac322e3231037329946f2bd13ed48874d97f5b8f5db1d"),
@@ -34,7 +34,7 @@ HASHES = {
 
 
 def heard(probe: Any) -> dict[tuple[str, str], tuple[np.ndarray, Rotation]]:
-    """Translation and rotation, by parent and child."""
+    """Return translation and rotation, by parent and child."""
     message = probe.next(TFMessage, "/tf_static", LISTENER)
     return {(t.header.frame_id, t.child_frame_id): _pose(t) for t in message.transforms}
 
@@ -99,7 +99,7 @@ def test_a_pose_that_is_none_is_refused_in_one_line(own_domain: dict[str, str]) 
 
 @pytest.mark.parametrize("kind", HASHES, ids=lambda kind: kind.__name__)
 def test_what_we_build_of_others_matches_theirs(probe: Any, kind: type) -> None:
-    """As it is announced: whoever has the original and compares would not be matched otherwise."""
+    """As announced: a holder of the original that compares hashes would otherwise not match."""
     topic = f"/{kind.__name__}"
     publisher = probe.node.create_publisher(kind, topic, LISTENER)
     probe.until(lambda: bool(probe.node.get_publishers_info_by_topic(topic)), 60.0)

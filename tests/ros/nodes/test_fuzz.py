@@ -1,4 +1,4 @@
-"""Mutated files at the doors of the nodes: loader and patients' service."""
+"""Mutated files given to the nodes: loader and patients' service."""
 
 from __future__ import annotations
 

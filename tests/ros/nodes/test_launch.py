@@ -1,4 +1,4 @@
-"""The launch files: evaluated by a stand-in for launch, and run by launch where it is installed."""
+"""Launch files: evaluated by a stand-in for launch, and run by launch where it is installed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.ros.helpers.doc_pages import ROOT
 
 FOLDER = ROOT / "avatar_ros" / "launch"
 PARAMS = ROOT / "params" / "planning_cell.yaml"
-# As `ros2 launch FILE name:=value` does it (ros2launch.api.launch_a_launch_file).
+# as `ros2 launch FILE name:=value` does it (ros2launch.api.launch_a_launch_file)
 ROS2_LAUNCH = """
 import sys, launch
 from launch.actions import IncludeLaunchDescription
@@ -42,7 +42,7 @@ raise SystemExit(service.run())
 
 @pytest.fixture
 def file(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """What the Python launch file defines, imported with the stand-in for launch."""
+    """Import the Python launch file with the stand-in for launch."""
     for name, module in fake_launch.modules().items():
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.setenv("AMENT_PREFIX_PATH", sys.prefix)
@@ -118,13 +118,13 @@ def test_the_file_in_yaml_includes_that_in_python_and_nothing_else() -> None:
 
 
 def launched(name: str, arguments: list[str], domain: dict[str, str]) -> subprocess.Popen[str]:
-    """An installed launch file, run by launch."""
+    """Run an installed launch file by launch."""
     needed = ("launch", "launch_ros", *(["launch_yaml"] if name.endswith("yaml") else []))
     missing = [package for package in needed if find_spec(package) is None]
     if missing:
         pytest.skip(f"not installed, and no wheel brings it: {', '.join(missing)}")
     path = Path(sys.prefix, "share/avatar_ros/launch", name)
-    # As the README exports them.
+    # as the README exports them
     ours = {"AMENT_PREFIX_PATH": sys.prefix, "PATH": str(Path(sys.prefix, "bin"))}
     paths = {n: f"{own}:{os.environ.get(n, '')}".rstrip(":") for n, own in ours.items()}
     return subprocess.Popen(

@@ -61,7 +61,7 @@ def test_without_vademecum_the_wrench_is_zero_and_a_broken_one_changes_nothing(
         assert wrench.header.frame_id == "organ"
         assert (wrench.header.stamp.sec, wrench.header.stamp.nanosec) == (0, 0)
         window = probe.next(LoopStatistics, "statistics", 1)
-        assert 0.0 < window.rate < 250.0  # there is no force to be late
+        assert 0.0 < window.rate < 250.0  # there is no force that could be late
         publisher = probe.node.create_publisher(VademecumFile, "vademecum", qos.LATCHED)
         publisher.publish(vademecum_file("0" * 64, "forged", b"x" * 1000))
         probe.until(lambda: "'forged' refused" in process.said(), 30.0)
@@ -154,14 +154,14 @@ def test_a_wrong_parameter_ends_the_node(
 
 END = 2.0  # from a signal to the end [s]
 PREFIX = Path(sys.prefix)
-# Without an atlas, which takes minutes to make, that node waits to be configured.
+# without an atlas, which takes minutes to make, that node waits to be configured
 ARGUMENTS = {"patient_interpolation": ["--ros-args", "-p", "autostart:=false"]}
 STATES = {"patient_interpolation": "unconfigured"}
 
 
 @pytest.fixture
 def shell(own_domain: dict[str, str]) -> dict[str, str]:
-    """What a user's shell has after the README's export, and the tests' domain."""
+    """Return the environment of a user's shell after the README's export, in the tests' domain."""
     kept = ("HOME", "LANG", "NUMBA_CACHE_DIR", "TMPDIR")
     environment = {name: os.environ[name] for name in kept if name in os.environ}
     environment |= {name: value for name, value in own_domain.items() if name.startswith("ROS_")}
@@ -193,12 +193,12 @@ def test_the_executables_are_those_that_are_documented() -> None:
 
 
 def executable(name: str) -> list[str]:
-    """What `ros2 run` starts."""
+    """Return the command that `ros2 run` starts."""
     return [str(PREFIX / "lib" / "avatar_ros" / name)]
 
 
 def module(name: str) -> list[str]:
-    """What the README has in its place where there is no `ros2`."""
+    """Return the README's command in its place without `ros2`."""
     return [str(PREFIX / "bin" / "python"), "-m", f"avatar_ros.nodes.{name}"]
 
 
@@ -285,7 +285,7 @@ def test_one_file_of_parameters_starts_a_cell_that_a_signal_ends(
 
 
 def child(process: subprocess.Popen[str], node: str) -> int | None:
-    """Number of the cell's process of a node."""
+    """Return the number of the cell's process of a node."""
     for number in children(process.pid):
         if f"avatar_ros.nodes.{node}".encode() in Path(f"/proc/{number}/cmdline").read_bytes():
             return number

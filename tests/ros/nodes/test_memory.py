@@ -1,4 +1,4 @@
-"""What loader, contact node and the processes that read for them keep in memory."""
+"""Memory of loader, contact node and the processes that read for them."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from tests.helpers.processes import has_ended
 from tests.helpers.slowness import Deadline, wait_until
 from tests.ros.conftest import START_TIMEOUT
 
-MOST = 60.0  # of a loader without what it announces [MB]
-# Those that only reading and preparing a vademecum need.
+MOST = 60.0  # of a loader without its announcement [MB]
+# modules that only reading and preparing a vademecum needs
 LIBRARIES = {"scipy.sparse", "scipy.spatial", "scipy.linalg", "skfem", "igl", "rslab", "h5py"}
 
 
@@ -49,7 +49,7 @@ def test_a_process_that_was_loaded_for_nothing_ends_too() -> None:
     try:
         reader.load(os.getpid)
         wait_until(lambda: reader.pid is None, 30.0)
-        reader.load(Imported("no_such_module", "f"))  # the first file says it as well
+        reader.load(Imported("no_such_module", "f"))  # the first file reports it as well
         assert reader.read("a", 0, os.getpid) != os.getpid()
     finally:
         reader.close()
@@ -64,9 +64,9 @@ def test_a_loader_keeps_little_beside_the_file_that_it_announces(
     assert probe.call(LoadVademecum, "load_vademecum", request).success
     pid = cell["vademecum_loader"].pid
     passed = Deadline(60.0)
-    while [*children(pid)]:  # until the process that read has ended
+    while [*children(pid)]:  # until the reading process has ended
         assert not passed
         probe.spin(0.2)
     held, file = Footprint.of(pid), (library / "twin.h5").stat().st_size / 1e6
     print(f"\nloader: {held.memory_mb:.0f} MB with a file of {file:.0f} MB")
-    assert held.memory_mb < MOST + 2.0 * file  # what is sent, and what was sent before
+    assert held.memory_mb < MOST + 2.0 * file  # the present and the previous message

@@ -1,4 +1,4 @@
-"""The pages in msg_docs/ and what the nodes offer, compared both ways."""
+"""The pages in msg_docs/ and the interfaces of the nodes, compared both ways."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from tests.ros.helpers.doc_pages import (
 from tests.ros.helpers.parameters import parameter_names, parameter_values
 
 NODES = ("vademecum_loader", "contact", "organ_markers")
-# Some of the contact node's topics exist only with these.
+# some of the contact node's topics exist only with these
 ASKED = {"tool_operating_state": True, "tool_state_command": "enable"}
-OVERRIDABLE = NODES[:2]  # whose quality of service parameters may change
+OVERRIDABLE = NODES[:2]  # nodes whose quality of service parameters may change
 
 
 @pytest.fixture(scope="module")
 def cell(own_domain: dict[str, str]) -> Iterator[list[Module]]:
-    """The nodes with nothing but their defaults, and what gives them all their topics."""
+    """Start the nodes with their defaults, and with the parameters that give all topics."""
     values = [word for name, value in ASKED.items() for word in ("-p", f"{name}:={value}")]
     arguments = {"contact": ["--ros-args", *values]}
     processes = [Module(node, arguments.get(node, []), own_domain) for node in NODES]
@@ -49,20 +49,20 @@ def probe(lasting_probe: Any) -> Any:
 
 
 def documented(node: str) -> set[tuple[str, str, str]]:
-    """Name, type and direction of what a node has by the index."""
+    """Return name, type and direction of a node's interfaces in the index."""
     return {(topic(row), row["type"], row["direction"]) for row in index() if row["node"] == node}
 
 
 @pytest.fixture(scope="module")
 def graph(cell: Any) -> Iterator[Any]:
-    """A node that discovered of the others all that the pages say."""
+    """Make a node that discovered all that the pages list."""
     with newcomer(lambda graph: all(offered(graph, n) >= documented(n) for n in NODES)) as probe:
         yield probe.node
 
 
 @pytest.fixture
 def running(cell: Any, probe: Any) -> Any:
-    """A probe beside a cell that is up."""
+    """Return a probe beside a cell that is up."""
     probe.next(ContactState, "contact_state", qos.state(1))
     return probe
 
@@ -87,7 +87,7 @@ def test_the_index_names_every_page() -> None:
 
 @pytest.mark.parametrize("node", NODES)
 def test_topics_and_services_are_those_of_the_pages(graph: Any, node: str) -> None:
-    # What one node sends any other may hear: it has its page.
+    # other nodes may hear it: its page is that of its sender
     heard = {(topic(row), row["type"], "in") for row in index() if row["direction"] == "out"}
     assert offered(graph, node) - heard == documented(node)
 

@@ -21,7 +21,7 @@ from tests.ros.helpers.doc_pages import entry, index, topic
 from tests.ros.helpers.hand import Hand, wait_for_model
 from tests.ros.helpers.running import running
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds an organ and starts nodes
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_it_comes_at_display_rate(
     )
     probe.until(lambda: len(came) > 5, 30.0)
     came.clear()
-    with within(3.0):  # tells a working timer from a broken one
+    with within(3.0):  # distinguishes a working timer from a broken one
         probe.until(lambda: len(came) > 30, 10.0)
     came.clear()
     probe.spin(3.0)
@@ -96,7 +96,7 @@ TOPICS = {"/organ_deformed", "/organ_rest", "/tool/measured_cp", "/tool/servo_cf
 
 
 def test_rviz_shows_all_of_it_and_is_matched() -> None:
-    """Displays as RViz 2 names them; a policy that a publisher does not offer hears nothing."""
+    """Displays named as in RViz 2; a policy that a publisher does not offer hears nothing."""
     displays = yaml.safe_load((PARAMS / "organ.rviz").read_text())["Visualization Manager"][
         "Displays"
     ]

@@ -1,4 +1,4 @@
-"""A node of a cell ends in any way and is started again: the state is that of before."""
+"""A node of a cell ends in any way and is started again: the earlier state returns."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ HOW = {"kill -9": signal.SIGKILL, "SIGINT": signal.SIGINT}
 
 
 class State:
-    """What a cell was made to do, as others see it."""
+    """State of a cell as others see it."""
 
     def __init__(self, probe: Any) -> None:
         self._probe = probe
 
     def choose(self, name: str) -> str:
-        """Another vademecum, material, limit and scene; the vademecum's id."""
+        """Choose another vademecum, material, limit and scene; return the vademecum's id."""
         ask = self._probe.call
         info = ask(LoadVademecum, "load_vademecum", LoadVademecum.Request(name=name)).info
         self.force(info.id)
@@ -45,20 +45,20 @@ class State:
         soft = np.linalg.norm(self.force(info.id))
         self.set(CHOSEN)
         stiffer = lambda: np.linalg.norm(self.force(info.id)) >= 1.1 * soft  # noqa: E731
-        wait_until(stiffer, START_TIMEOUT)  # in use some tenths of a second on
+        wait_until(stiffer, START_TIMEOUT)  # in use after some tenths of a second
         return str(info.id)
 
     def set(self, values: dict[str, float]) -> None:
         assert all(set_parameters(self._probe, "contact", values))
 
     def shows_fewer_modes(self, rank: int) -> None:
-        """A budget is in force: fewer modes than there are can be shown at all."""
+        """Check that a budget is in force: fewer modes than the rank are shown."""
         topic = qos.STATISTICS
         wanted = lambda window: 0 < window.modes < rank  # noqa: E731
         self._probe.next(LoopStatistics, "statistics", topic, wanted, 2 * START_TIMEOUT)
 
     def force(self, identity: str) -> np.ndarray:
-        """On the tool that holds still, once all of it is felt and nothing fades."""
+        """Return the force on a still tool, once it is complete and nothing fades."""
         wrenches: dict[tuple[int, int], np.ndarray] = {}
         listener = self._probe.node.create_subscription(
             WrenchStamped,
@@ -129,7 +129,7 @@ def test_what_is_started_again_goes_on_as_before(
         wrong = InterpolatePatient.Request(surface="nowhere.obj")
         answer = probe.call(InterpolatePatient, "interpolate_patient", wrong)
         assert not answer.success and "nowhere.obj" in answer.message
-    if name == "loader":  # says it to who comes late, too
+    if name == "loader":  # sent to late listeners, too
         info = probe.next(VademecumInfo, "vademecum_info", qos.LATCHED)
         assert info.id == identity
     after = seen.force(identity)
@@ -141,7 +141,7 @@ def test_what_is_started_again_goes_on_as_before(
 
 
 def wait_until_kept(file: Path, name: str) -> None:
-    """A parameter that changed is written after it is in force."""
+    """Wait until a changed parameter is written, which happens after it is in force."""
     kept = lambda: name in json.loads(file.read_text())["changed"]  # noqa: E731
     wait_until(kept, START_TIMEOUT, f"{name} was not kept in {file}")
 
@@ -166,7 +166,7 @@ def test_a_budget_is_in_force_again(
 
 
 class Started:
-    """In place of a node with a directory for its state."""
+    """Stand-in for a node with a directory for its state."""
 
     def __init__(self, folder: Path) -> None:
         self.said: list[str] = []

@@ -39,12 +39,12 @@ from tests.ros.helpers.doc_pages import index, offered, parameter_rows, yaml_par
 from tests.ros.helpers.parameters import parameter_names, parameter_values
 from tests.ros.helpers.refusals import refusal
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds an atlas and starts nodes
 
 NODE = "patient_interpolation"
-# A member of the atlas that does not count: registered already, meshed and combined anew.
+# a member of the atlas that does not count: registered already, meshed and combined anew
 PATIENT: dict[str, Any] = {"surface": "liver0.obj", "leave_out": ["liver0"]}
-TIMEOUT = 60.0  # of one patient, on a busy machine [s]
+TIMEOUT = 60.0  # for one patient, on a busy machine [s]
 INTERPOLATED = 30.0  # processor time from file to file, as the README says [s]
 
 
@@ -72,7 +72,7 @@ def probe(lasting_probe: Any) -> Any:
 
 @pytest.fixture
 def files(folder: Path) -> Callable[[], set[str]]:
-    """What lies in the library, hidden files too."""
+    """Return a function that lists the library, hidden files too."""
     return lambda: set(os.listdir(folder))
 
 
@@ -82,7 +82,7 @@ def _ask(probe: Any, **fields: Any) -> InterpolatePatient.Response:
 
 
 class Pursuit:
-    """A goal on its way: what was told of it, its cancellation, its result."""
+    """Goal on its way: its feedback, cancellation and result."""
 
     def __init__(self, probe: Any, **fields: Any) -> None:
         self._probe = probe
@@ -113,7 +113,7 @@ class Pursuit:
         return answer.status, answer.result
 
 
-# --- what comes out ---------------------------------------------------------------------------
+# --- results ----------------------------------------------------------------------------------
 
 
 def test_the_service_writes_what_loader_and_contact_take(
@@ -178,7 +178,7 @@ def test_a_mesh_in_the_request_is_built_by_the_action(
     stages = [told.stage.split(":")[0] for told in pursuit.told]
     stages = list(dict.fromkeys(stages))
     order = ["loading", "surface", "registration", "mesh", "response", "certify", "save"]
-    # what is told before the two have found one another is lost
+    # messages before discovery are lost
     assert stages == order[order.index(stages[0]) :]
     assert "mesh" in stages
     assert all(0.0 <= told.fraction <= 1.0 for told in pursuit.told)
@@ -244,7 +244,7 @@ def test_a_preview_shows_what_the_template_does_not_reach(
     assert any("off the surface" in line for line in found.notices)
 
 
-# --- what the pages say -----------------------------------------------------------------------
+# --- pages ------------------------------------------------------------------------------------
 
 
 def test_services_and_actions_are_those_of_the_pages(node: Module) -> None:
@@ -255,7 +255,7 @@ def test_services_and_actions_are_those_of_the_pages(node: Module) -> None:
     assert documented and len(actions) == 1
 
     def seen(graph: Any) -> tuple[dict[str, str], list[Any]]:
-        """An action is told by its topics, which may be discovered after the services."""
+        """Return an action's topics; they may be discovered after the services."""
         found = {name: kind for name, kind, _ in offered(graph, NODE) if "_action" not in name}
         if not found:  # nor the node itself
             return {}, []
@@ -278,7 +278,7 @@ def test_parameters_are_those_of_page_and_yaml_file(node: Module, probe: Any) ->
     assert parameter_values(probe, NODE, names) == {name: values[name] for name in names}
 
 
-# --- what is refused --------------------------------------------------------------------------
+# --- refusals ---------------------------------------------------------------------------------
 
 
 def _box(side: float) -> Mesh:
@@ -289,7 +289,7 @@ def _box(side: float) -> Mesh:
 
 
 def _without(mesh: Mesh, what: str) -> Mesh:
-    """The mesh, spoilt."""
+    """Return the mesh, damaged."""
     if what == "lid":
         mesh.triangles = mesh.triangles[2:]
     elif what == "number":
@@ -382,7 +382,7 @@ def test_a_wrong_parameter_is_refused(
     assert reason in refusal(NODE, *_values(folder, *arguments))
 
 
-# --- while one is built -----------------------------------------------------------------------
+# --- during a build ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("stage", ["", "mesh", pytest.param("response", marks=pytest.mark.long)])

@@ -1,4 +1,4 @@
-"""Accuracy and time as the contact node keeps and says them."""
+"""Accuracy and time in the contact node: enforced and reported."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.helpers.hand import Hand, felt
 from tests.ros.helpers.parameters import parameter_values, set_parameter
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds an organ and starts nodes
 
 # --- Shedding, without a node ------------------------------------------------------------------
 
@@ -54,7 +54,7 @@ def test_nobody_looks_and_no_mode_is_left_out(organ: Any) -> None:
 
 
 def test_the_log_names_modes_left_out_once_a_minute(probe: Probe) -> None:
-    """And taken back, at another severity, which rclpy does not let one line of code have."""
+    """The return is logged with another severity, which rclpy forbids in one line of code."""
     now, said = [0.0], []
     logger = probe.node.get_logger()
 
@@ -130,7 +130,7 @@ def hand(cell: dict[str, Any], probe: Any, touch: tuple[np.ndarray, np.ndarray])
 
 
 def set_budget(probe: Any, **value: Any) -> Any:
-    """Set a parameter below ``accuracy``; the answer."""
+    """Set a parameter below ``accuracy``; return the answer."""
     ((name, wanted),) = value.items()
     return set_parameter(probe, "contact", f"accuracy.{name}", wanted)
 
@@ -155,7 +155,7 @@ def test_force_comes_with_its_error(probe: Any, hand: Hand) -> None:
 def test_a_tolerance_shows_fewer_modes_and_leaves_the_force(
     probe: Any, hand: Hand, organ: Any
 ) -> None:
-    """However noisy the machine, the fastest of all details is none with all modes."""
+    """On any busy machine, the fastest of all details is not the one with all modes."""
     rank = organ.n_modes
     before = statistics(probe, hand, lambda s: s.modes == rank and s.step_p99 > 0.0)
     assert before.modes_shown == rank or before.missed > 0
@@ -197,7 +197,7 @@ def test_a_budget_without_meaning_is_refused_at_once(
 
 
 def diagnostics(probe: Any, hand: Hand, wanted: Any) -> dict[str, DiagnosticStatus]:
-    """The statuses of the contact node by name, once they are ``wanted``."""
+    """Return the contact node's statuses by name, once they are ``wanted``."""
     named = lambda array: {status.name: status for status in array.status}  # noqa: E731
     array = probe.next(
         DiagnosticArray, "/diagnostics", qos.STATISTICS, lambda a: wanted(named(a)), 60.0, hand
@@ -225,5 +225,5 @@ def test_diagnostics_name_a_fault_its_remedy_and_its_end(probe: Any, hand: Hand)
     hand.pose.header.frame_id = "organ"
     sound = diagnostics(probe, hand, lambda n: n["/contact: tool"].level == DiagnosticStatus.OK)
     assert sound["/contact: tool"].message == "poses valid, full force sent"
-    assert sound["/contact: tool"].hardware_id == "/tool"  # as its driver is called
+    assert sound["/contact: tool"].hardware_id == "/tool"  # named after its driver
     assert sound["/contact: loop"].hardware_id == socket.gethostname()

@@ -1,4 +1,4 @@
-"""Bands of the force: what the loop sends, what is prepared for it, and what the page makes of it.
+"""Bands of the force: sent by the loop, prepared for it, and shown on the page.
 
 The loop is stepped by hand; how a running node takes the parameter is in test_uncertainty.
 """
@@ -35,7 +35,7 @@ from tests.helpers.soft_organ import soft_organ
 from tests.ros.helpers.refusals import refusal
 from tests.ros.helpers.stepped_loop import Queue, SteppedLoop, pose
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds organs
 
 TIP = Tip("sphere", 5e-3)
 LOW, HIGH = 0.6, 1.7
@@ -50,7 +50,7 @@ def ratios(data: Any, low: float = LOW, high: float = HIGH) -> np.ndarray:
 
 
 class Banded:
-    """A bench whose tool has a band, 3 mm deep."""
+    """Bench whose tool has a band, 3 mm deep."""
 
     def __init__(self, bench: SteppedLoop, touch: Any, safety: Safety | None = None) -> None:
         self.bench, self.loop, queue = bench, bench.loop, bench.poses[0]
@@ -62,13 +62,13 @@ class Banded:
         self.tip = bench.press(touch, -1e-3)
 
     def use(self, organ: Any, identity: str, **band: float) -> None:
-        """Another model, with a band if its ratios are given."""
+        """Use another model, with a band if its ratios are given."""
         data = prepare(organ, (TIP,), cloud="off")
         found = ForceBand(data, ratios(data, **band), DEPTHS) if band else None
         self.loop.active = ActiveModel(identity, data, self.bench.settings, band=found)
 
     def step(self) -> tuple[np.ndarray, np.ndarray]:
-        """Force and band of the next period."""
+        """Return force and band of the next period."""
         _, force = self.bench.step(pose(self.tip))
         return force, np.array([_force(queue.sent[-1]) for queue in self.edges])
 
@@ -131,7 +131,7 @@ def test_without_a_pose_the_band_is_zero(banded: Banded) -> None:
 def test_the_band_stays_while_the_force_moves_to_another_material(
     banded: Banded, organ: Any
 ) -> None:
-    """Twice the modulus in use, half the ratios: the force grows within a blend, the band stays."""
+    """Twice the modulus, half the ratios: the force grows within a blend, the band stays."""
     force, band = banded.step()
     stiff = organ.at(young=2.0 * organ.material.young_modulus)
     banded.use(stiff, "a", low=LOW / 2.0, high=HIGH / 2.0)
@@ -200,7 +200,7 @@ def test_sending_a_band_leaves_nothing_behind(banded: Banded) -> None:
     assert grown < 2048
 
 
-# --- what is prepared --------------------------------------------------------------------------
+# --- preparation -------------------------------------------------------------------------------
 
 KNOWN = {"young": Lognormal(5e3, 1.4), "poisson": Uniform(0.32, 0.48)}
 
@@ -244,7 +244,7 @@ def test_edges_are_found_once_for_a_slider_that_is_dragged(
     assert len(found) == 1
     np.testing.assert_allclose(ratio[0] - ratio[1], np.log(2.0), atol=1e-5)
     preparer.prepare(default_spec(soft, (TIP,), values={"contrast": 3.0}), mappings(KNOWN))
-    assert len(found) == 2  # the contrast is not known, and has another value now
+    assert len(found) == 2  # the contrast has no distribution, and another value now
 
 
 def test_what_an_organ_has_no_place_for_is_said_and_the_rest_used(organ: Any, soft: Any) -> None:

@@ -1,4 +1,4 @@
-"""The material as parameters of the contact node: felt while the tool presses, refused in words."""
+"""The material as parameters of the contact node: it acts while the tool presses, or is refused."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.long]  # an organ with coordinates is
 
 @pytest.fixture(scope="module")
 def soft_organ() -> Any:
-    """A coarse phantom over Poisson's ratio."""
+    """Build a coarse phantom over Poisson's ratio."""
     return _soft_organ()
 
 
@@ -72,7 +72,7 @@ def nodes(
 
 @pytest.fixture
 def hand(nodes: dict[str, Module], probe: Any, soft_organ: Any) -> Hand:
-    """A tool that presses the organ by 1 mm."""
+    """Press the organ by 1 mm."""
     probe.next(ContactState, "contact_state", qos.state(1), lambda state: state.vademecum_id)
     surface = soft_organ.surface
     j = middle_of_access(soft_organ)
@@ -82,19 +82,21 @@ def hand(nodes: dict[str, Module], probe: Any, soft_organ: Any) -> Hand:
 
 
 def _settled(probe: Any, hand: Hand) -> np.ndarray:
-    """The force once it is engaged."""
+    """Return the force once it is engaged."""
     return felt(probe, hand)[1]
 
 
 def _set(probe: Any, **value: float) -> Any:
-    """Set a parameter below ``material``; the answer."""
+    """Set a parameter below ``material``; return the answer."""
     ((name, wanted),) = value.items()
     return set_parameter(probe, "contact", f"material.{name}", wanted)
 
 
 def _until(probe: Any, hand: Hand, wanted: Any) -> np.ndarray:
-    """The force that is wanted, once it is engaged: one that comes back after a pause in the poses
-    is smaller, too, and no sign of another material."""
+    """Wait for a wanted force, once it is engaged.
+
+    After a pause in the poses the force is smaller for a while, without another material.
+    """
     passed = Deadline(20.0)
     while not wanted(force := _settled(probe, hand)):
         assert not passed, f"last felt: {force}"
@@ -102,7 +104,7 @@ def _until(probe: Any, hand: Hand, wanted: Any) -> np.ndarray:
 
 
 def _set_back(probe: Any, hand: Hand, force: float, name: str = "young_modulus") -> None:
-    """To the value in the vademecum, and wait until it is felt: a change takes its time."""
+    """Set the vademecum's value back, and wait until the force shows it."""
     assert _set(probe, **{name: 0.0}).successful
     _until(probe, hand, lambda f: abs(np.linalg.norm(f) / force - 1.0) < 1e-3)
 
@@ -190,7 +192,7 @@ def test_the_loop_goes_on_while_the_material_changes(probe: Any, hand: Hand) -> 
         assert _set(probe, young_modulus=0.2e6 + 1e4 * k).successful
     statistics = probe.next(LoopStatistics, "statistics", qos.STATISTICS, meanwhile=hand)
     _until(probe, hand, lambda f: np.linalg.norm(f) > 1.4 * before)  # the last of them
-    # tells a working loop from a broken one; `avatar bench cell` measures it
+    # distinguishes a working loop from a broken one; `avatar bench cell` measures it
     assert statistics.missed < 0.5 * statistics.periods
     _set_back(probe, hand, before)
 
@@ -207,16 +209,16 @@ def test_of_a_slider_that_is_dragged_the_last_value_counts_soon(probe: Any, hand
     begin = time.monotonic()
     after = _until(probe, hand, lambda f: np.linalg.norm(f) > 1.999 * before)
     assert np.linalg.norm(after) == pytest.approx(2.0 * before, rel=1e-3)
-    # the one in work, then the last; all forty would take forty times one
+    # the one in work, then the last; all forty would take forty times as long
     assert time.monotonic() - begin < 10.0 * alone
     _set_back(probe, hand, before)
 
 
-# --- values that a calibration found --------------------------------------------------------
+# --- values found by a calibration ----------------------------------------------------------
 
 
 def set_by_command(domain: dict[str, str], *values: str) -> tuple[int, str]:
-    """What ``avatar calibrate --set`` runs: exit code and what was said."""
+    """Run the command of ``avatar calibrate --set``; return exit code and output."""
     command = [sys.executable, "-m", "avatar_ros.nodes.set_material", *values]
     environment = {**os.environ, **domain}
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Scenes in the contact node: loaded while a tool presses, refused in words, faded in."""
+"""Scenes in the contact node: loaded while a tool presses, refused with a reason, faded in."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ ORDER = PreparationRequest("", "", "", (asdict(Tip()),), None, "surface", 1e-3)
 
 
 class Palpation:
-    """A tool on the organ, and what it feels."""
+    """A tool on the organ, and the force on it."""
 
     def __init__(self, probe: Any, tip: np.ndarray, normal: np.ndarray) -> None:
         self.probe, self.tip, self.normal = probe, tip, normal
@@ -64,7 +64,7 @@ class Palpation:
         self.probe.node.destroy_subscription(self._listener)
 
     def go(self, offset: np.ndarray, seconds: float = 0.3) -> np.ndarray:
-        """Move there in small steps, stay, and tell the force."""
+        """Move there in small steps, stay, and return the force."""
         p = self.hand.pose.pose.position
         start, end = np.array([p.x, p.y, p.z]), self.tip + offset
         for part in np.linspace(0.0, 1.0, 50):
@@ -73,7 +73,7 @@ class Palpation:
         return self.hold(seconds)
 
     def hold(self, seconds: float = 0.3) -> np.ndarray:
-        """Stay; the last force."""
+        """Stay; return the last force."""
         self.felt.clear()
         self.probe.spin(seconds)
         self.probe.until(lambda: bool(self.felt), 10.0)
@@ -112,7 +112,7 @@ def lasting_palpation(
 
 @pytest.fixture
 def palpation(lasting_palpation: Palpation) -> Palpation:
-    """A tool that presses a bare organ by 2 mm: nothing is left of what was before."""
+    """Press a bare organ by 2 mm, without traces of earlier tests."""
     assert lasting_palpation.load(BARE).success
     lasting_palpation.hand.pose.pose.orientation = Quaternion(w=1.0)
     lasting_palpation.go(np.zeros(3), 0.05)
@@ -120,7 +120,7 @@ def palpation(lasting_palpation: Palpation) -> Palpation:
 
 
 def _refusal(path: Path, organ: Any) -> str:
-    """Why the organ of the tests cannot serve a scene; empty if it can."""
+    """Return why the organ of the tests cannot serve a scene; empty if it can."""
     try:
         what = model_spec(organ, ORDER, read_scene(path))
         what.layout(what.finest, ORDER.period)
@@ -169,7 +169,7 @@ def test_most_shipped_scenes_load_here(organ: Any) -> None:
         ({"yaml": "effects: {viscoelasticity: {file: prony.csv}}"}, "this scene is no file"),
         ({"yaml": "outputs: {modes: 5000}"}, "5000 modes"),
         ({"yaml": "tools: [{name: a}, {name: b}]\neffects: [several_tools]"}, "parameter tools"),
-        ({"yaml": "\0"}, "both are empty"),  # a string ends there, on its way
+        ({"yaml": "\0"}, "both are empty"),  # a string ends there in transport
         ({"yaml": "#" * (MAX_BYTES + 1)}, f"at most {MAX_BYTES}"),
         ({"yaml": "\U0001f600" * MAX_BYTES}, "with less"),
     ],
@@ -192,7 +192,7 @@ def test_with_friction_a_turning_tool_drags_the_tissue(palpation: Palpation) -> 
     before = palpation.across_force(palpation.hold())
 
     def is_dragged() -> bool:
-        """A busy machine may lose the poses of a turn."""
+        """Return whether the turn drags it: a busy machine may lose its poses."""
         # the tip's lowest point moves along `across`: turn x (-n) = across
         _turn_by(palpation, 0.2 * np.cross(palpation.across, palpation.normal))
         force = palpation.hold()
@@ -256,7 +256,7 @@ def test_the_force_does_not_jump_when_effects_change(
     largest = np.linalg.norm(np.diff(felt, axis=0), axis=1).max()
     print(f"\n{len(felt)} wrenches, {apart:.4f} N apart, largest change {largest:.5f} N")
     assert apart > 0.02
-    # 1/100 for each period; some wrenches do not arrive here: the tests of the loop count them.
+    # 1/100 for each period; some wrenches do not arrive here: the tests of the loop count them
     assert largest < 0.1 * apart
 
 

@@ -1,4 +1,4 @@
-"""Supports at the nodes: what parameters and the planning page make of them, without a cell."""
+"""Supports in the nodes: parameters and the planning page, without a cell."""
 
 from __future__ import annotations
 

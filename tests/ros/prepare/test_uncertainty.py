@@ -1,4 +1,4 @@
-"""What is known of the material as a parameter of the contact node: bands beside the force."""
+"""Distributions of the material as a parameter of the contact node: bands of the force."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ __all__ = ["hand", "nodes", "soft_organ"]  # the fixtures
 YOUNG = "young: {lognormal: {median: 5.0e+3, factor: 1.4}}\n"
 POISSON = "poisson: {uniform: {low: 0.32, high: 0.48}}\n"
 EDGES = ("force_low", "force_high")
-SILENCE = 2.0  # without an edge, after which there is no band [s]
+SILENCE = 2.0  # time without an edge after which there is no band [s]
 
 
 def give(probe: Any, value: str) -> Any:
-    """Set the parameter; the answer."""
+    """Set the parameter; return the answer."""
     return set_parameter(probe, "contact", "uncertainty", value)
 
 
@@ -36,7 +36,7 @@ def given(probe: Any) -> str:
 
 
 class Ears:
-    """Hears the force and both edges."""
+    """Listener to the force and both edges."""
 
     def __init__(self, probe: Any, hand: Hand) -> None:
         self._probe, self._hand = probe, hand
@@ -50,7 +50,7 @@ class Ears:
         )
 
     def band(self, wanted: Any = lambda force, band: True) -> tuple[np.ndarray, np.ndarray]:
-        """Force and edges of the same stamp, of the force's size, once they are as wanted."""
+        """Return a force with its size's edges, of one stamp, once they are as wanted."""
         passed = Deadline(60.0)
         while True:
             assert not passed, "no such band"
@@ -64,7 +64,7 @@ class Ears:
                     return force, np.array(band)
 
     def is_silent(self) -> bool:
-        """Whether edges cease to come: another model is prepared first."""
+        """Return whether edges cease to come: another model is prepared first."""
         passed = Deadline(30.0)
         while not passed:
             self.heard["force_low"].clear()
@@ -143,7 +143,7 @@ def test_a_name_that_does_not_come_with_avatar_is_refused(probe: Any, hand: Hand
 def test_what_the_next_organ_lacks_is_said_and_the_rest_used(
     probe: Any, hand: Hand, ears: Ears, tmp_path: Path
 ) -> None:
-    """An organ of one material comes while Poisson's ratio is known, and then the first again."""
+    """An organ of one material comes while Poisson's ratio is uncertain, then the first again."""
     told: list[str] = []
     log = probe.node.create_subscription(Log, "/rosout", lambda m: told.append(m.msg), 100)
     assert give(probe, file(tmp_path, YOUNG + POISSON)).successful

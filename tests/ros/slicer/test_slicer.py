@@ -1,4 +1,4 @@
-"""A program that speaks OpenIGTLink beside the cell: pyigtl's own client, and sockets that lie."""
+"""An OpenIGTLink program beside the cell: pyigtl's own client, and sockets with false messages."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from tests.ros.helpers.doc_pages import parameter_rows, yaml_parameters
 from tests.ros.helpers.hand import wait_for_model
 from tests.ros.helpers.running import running
 
-pytestmark = pytest.mark.long  # for the organs that it builds or the nodes that it starts
+pytestmark = pytest.mark.long  # it builds an organ and starts nodes
 
 SECONDS = 30.0  # for an answer
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def unpacked(self: Any, content: bytes) -> None:
-    """POLYDATA, which pyigtl 0.3.4 sends but cannot read: 10 numbers, points, four sorts of cells.
+    """POLYDATA, which pyigtl 0.3.4 sends but cannot read: 10 numbers, points, four cell types.
 
     See openigtlink.org/protocols/v3_polydata.html.
     """
@@ -84,7 +84,7 @@ def slicer(bridge: Module, port: int) -> Iterator[Any]:
 
 
 def heard(client: Any, probe: Any, device: str, wanted: Any = lambda message: True) -> Any:
-    """The next message for a device that is wanted."""
+    """Return the next message for a device that is wanted."""
     passed = Deadline(SECONDS)
     while not passed:
         probe.spin(0.05)
@@ -95,7 +95,7 @@ def heard(client: Any, probe: Any, device: str, wanted: Any = lambda message: Tr
 
 
 def points_of(cloud: PointCloud2) -> np.ndarray:
-    """Positions of a cloud, shape (n, 3) [mm]."""
+    """Return positions of a cloud, shape (n, 3) [mm]."""
     return 1e3 * np.frombuffer(cloud.data, np.float32).reshape(-1, 6)[:, :3]
 
 
@@ -112,7 +112,7 @@ def test_the_organ_comes_in_millimetres(cell: Any, probe: Any, slicer: Any, orga
 def test_a_tool_that_is_moved_there_presses_here(
     cell: Any, probe: Any, slicer: Any, organ: Any, touch: tuple[np.ndarray, np.ndarray]
 ) -> None:
-    """And the answer is seen there: the deformed organ, the force, the tool."""
+    """The answer is seen there: the deformed organ, the force, the tool."""
     wait_for_model(cell, probe)
     tip, normal = touch
     rest = 1e3 * organ.surface_vertices
@@ -133,7 +133,7 @@ def test_a_tool_that_is_moved_there_presses_here(
         np.sum([(c.force.x, c.force.y, c.force.z) for c in state.contacts], axis=0)
     )
     assert force > 0.1
-    # A busy machine shows fewer modes from one period to the next: one of the last clouds is it.
+    # a busy machine shows fewer modes from one period to the next: it equals one of the last clouds
     clouds: deque[np.ndarray] = deque(maxlen=500)
     listener = probe.node.create_subscription(
         PointCloud2, "deformation", lambda cloud: clouds.append(points_of(cloud)), qos.NEWEST
@@ -195,7 +195,7 @@ def test_page_and_file_hold_every_parameter_at_its_default() -> None:
 
 
 class Ear:
-    """A link on a free port, and what it heard and said."""
+    """Link on a free port, with its received messages and reports."""
 
     def __init__(self) -> None:
         self.heard: list[Any] = []
@@ -256,7 +256,7 @@ def test_what_is_not_understood_is_skipped(ear: Ear) -> None:
 
 
 def test_who_does_not_read_gets_the_newest_afterwards(ear: Ear) -> None:
-    """Nothing piles up, and whoever sends never waits."""
+    """Nothing piles up, and the sender never waits."""
     points, faces = np.zeros((20_000, 3)), messages.polygons_of(np.zeros((2, 3), int))
     with ear.connect() as client:
         with within(20.0):

@@ -1,4 +1,4 @@
-"""One page for all tests of it: with a server that no browser asks, or in a real browser."""
+"""One page for all its tests: with a server without a browser, or in a real browser."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _NEEDED = {
 
 
 class PageModule(pytest.Module):
-    """Tests of the page, which are skipped where it cannot run."""
+    """Module of page tests, which are skipped where the page cannot run."""
 
     def collect(self) -> Iterable[Any]:
         for name, reason in _NEEDED.items():
@@ -45,7 +45,7 @@ def viser_server() -> Iterator[Any]:
 
 @pytest.fixture
 def server(viser_server: Any) -> Any:
-    """An empty page: viser's own, as no stand-in refuses what viser would refuse."""
+    """Make an empty page: viser's own, so that its refusals show."""
     viser_server.scene.reset()
     viser_server.gui.reset()
     return viser_server
@@ -53,7 +53,7 @@ def server(viser_server: Any) -> Any:
 
 @pytest.fixture(scope="session")
 def cube() -> Any:
-    """An organ as the page shows it: a cube of 200 mm."""
+    """Return a cube of 200 mm as the page shows an organ."""
     from avatar_ros.ui.view.organ import Organ
 
     return Organ.of(replace(box("cube"), id="a" * 64))
@@ -61,7 +61,7 @@ def cube() -> Any:
 
 @pytest.fixture
 def state() -> Any:
-    """The memory that the page shares with the driver of two tools."""
+    """Make the memory that the page shares with the driver of two tools."""
     from avatar_ros.ui.tools.tool_state import SharedToolState
 
     from tests.ros.helpers.page import PLACES
@@ -91,7 +91,7 @@ def shots(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def folder(folder: Path, organ: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A library of the module's own: what the page writes is found there by its kind."""
+    """Make a library of the module's own: files that the page writes are found there by kind."""
     from avatar_core.vademecum.storage import save_vademecum
 
     own = tmp_path_factory.mktemp("library")
@@ -102,7 +102,7 @@ def folder(folder: Path, organ: Any, tmp_path_factory: pytest.TempPathFactory) -
 
 @pytest.fixture(scope="module")
 def contact() -> list[str]:
-    """Parameters of the contact node; a module may have its own."""
+    """Return parameters of the contact node; a module may have its own."""
     return []
 
 
@@ -117,7 +117,7 @@ def port() -> int:
 def nodes(
     chromium: str, own_domain: dict[str, str], folder: Path, contact: list[str], port: int
 ) -> Iterator[dict[str, Any]]:
-    """All nodes of the page's cell, by name."""
+    """Start all nodes of the page's cell, by name."""
     from tests.ros.helpers.browser import TOKEN, nodes_of_a_page
 
     library = ["-p", f"library_dir:={folder}"]
@@ -134,7 +134,7 @@ def nodes(
 
 @pytest.fixture(scope="module")
 def page(nodes: Any, port: int, shots: Path) -> Iterator[Any]:
-    """A browser on the page."""
+    """Open a browser on the page."""
     from tests.ros.helpers.browser import opened
 
     with opened(port, shots) as page:
@@ -146,7 +146,7 @@ def page(nodes: Any, port: int, shots: Path) -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def shown(folder: Path, nodes: Any) -> Any:
-    """The organ that the page shows first."""
+    """Return the organ that the page shows first."""
     from avatar_ros.ui.view.organ import Organ
 
     from avatar_core.vademecum.storage import load_vademecum

@@ -1,6 +1,6 @@
-"""The planning page in a real browser: dragged, felt, and well again after a crash.
+"""The planning page in a real browser: dragged, pressed, and working again after a crash.
 
-One cell for all tests, in this order: what a test leaves behind, the next ones bear.
+One cell for all tests, in this order: later tests see the state that earlier ones leave.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ pytestmark = pytest.mark.long
 SIZES = (WINDOW, (900, 700), (1920, 1080))
 TABS = ("Tool", "Organ", "Measure", "Plan", "Patient", "Scene")
 PROGRESS = re.compile(r"\n\w+: \d+%")
-# What is seen of a page's controls: name, left, top, right, bottom [px].
+# visible controls of a page: name, left, top, right, bottom [px]
 CONTROLS = """() => [...document.querySelectorAll('button, input, [role=tab]')]
   .filter(e => e.checkVisibility() && e.getBoundingClientRect().width > 12)
   .map(e => [e.innerText || e.value || e.tagName, e.getBoundingClientRect()])
   .map(([name, r]) => [name, r.left, r.top, r.right, r.bottom])"""
-# What lacks a name, and text whose colour contrasts less than 4.5:1 with its ground (WCAG 2.1).
+# elements without a name, and text with a contrast below 4.5:1 (WCAG 2.1)
 UNNAMED = """() => [...document.querySelectorAll('button, canvas, input, [role=slider]')]
   .filter(e => e.checkVisibility() && e.ariaHidden != 'true')
   .filter(e => !(e.ariaLabel || e.innerText || e.labels?.length)).map(e => e.outerHTML)"""
@@ -84,7 +84,7 @@ PALE = """() => {
     return own || e.value ? pale(e, own || e.value) : [];
   });
 }"""
-# Where the cube is while viser moves the panel, as it does when the window changes.
+# position of the cube while viser moves the panel, as it does when the window changes
 CUBE_WHILE_GLIDING = """() => {
   const panel = document.querySelector('[data-dock-column]');
   panel.style.transform = 'translateX(-300px)';
@@ -93,8 +93,8 @@ CUBE_WHILE_GLIDING = """() => {
   return place;
 }"""
 CHOSEN_BY_ANOTHER = 150e3  # Young's modulus [Pa], as the contact node is started
-DEEP = -0.002  # of the tip's centre over the surface, while it presses [m]
-ENOUGH = 3.0  # force that stays one while the tool swings [N]
+DEEP = -0.002  # height of the tip's centre over the surface, while it presses [m]
+ENOUGH = 3.0  # force that remains while the tool swings [N]
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,7 @@ def folder(folder: Path) -> Path:
 
 
 def ct_of(organ: Vademecum) -> tuple[np.ndarray, np.ndarray]:
-    """An image of tissue in fat [HU], on the grid of the distance to the organ, and where it is."""
+    """Return an image of tissue in fat [HU], on the organ's distance grid, with its place."""
     field = organ.tip_field
     affine = np.diag([*np.full(3, 1e3 * field.spacing[0]), 1.0])
     affine[:3, 3] = 1e3 * np.asarray(field.origin)
@@ -124,7 +124,7 @@ def test_what_another_client_chose_is_shown(page: Any) -> None:
 
 
 def displacement_of(page: Any) -> float:
-    """The largest that the page says [mm]."""
+    """Read the largest displacement on the page [mm]."""
     found = re.search(r"displacement ([\d.]+) mm", page.inner_text("body"))
     return float(found[1]) if found else 0.0
 
@@ -144,7 +144,7 @@ def test_keys_move_the_tool(page: Any) -> None:
     page.mouse.click(60, 700)  # nothing is there, but the page listens
     for _ in range(60):
         page.keyboard.press("u")
-        page.wait_for_timeout(400)  # a page that lags would press on, through the organ
+        page.wait_for_timeout(400)  # a slow page would press on, through the organ
         if force_of(page) > 0.05:
             break
     until(page, lambda: force_of(page) > 0.05, "a force", 5.0)
@@ -170,7 +170,7 @@ def test_a_list_that_was_chosen_from_gives_the_keys_back_to_the_tool(page: Any) 
 
 @contextmanager
 def held(page: Any, shown: Organ) -> Iterator[str]:
-    """The tool presses, and its number of newtons [N] is still."""
+    """Press the tool until its number of newtons [N] stands still."""
     drag(page, shown, 0.020, -0.004)
     page.mouse.up()
     pressed(page, ENOUGH)
@@ -188,12 +188,12 @@ def is_still(page: Any) -> bool:
 
 
 def numbers(page: Any) -> str:
-    """Force, its error and displacement, as the panel writes them."""
+    """Read force, its error and displacement, as the panel writes them."""
     return "\n".join(page.inner_text("#numbers").splitlines()[:2])
 
 
 def driver_of(node: Module) -> int:
-    """Process that sends the poses of the page."""
+    """Return the process that sends the poses of the page."""
     children = Path(f"/proc/{node.pid}/task").glob("*/children")
     for child in (int(word) for path in children for word in path.read_text().split()):
         if "tool_driver" in Path(f"/proc/{child}/cmdline").read_text():
@@ -245,7 +245,7 @@ def in_force(probe: Probe, name: str) -> float:
 
 
 def vermilion(page: Any, shot: Path) -> np.ndarray:
-    """Pixels of the tumour, not of tissue, (n, 2): down, right."""
+    """Return pixels of the tumour, not of tissue, (n, 2): down, right."""
     from PIL import Image
 
     page.screenshot(path=shot)
@@ -283,7 +283,7 @@ def test_a_slider_is_felt(page: Any, shots: Path, lasting_probe: Probe) -> None:
 
 
 def dark_part(page: Any, shot: Path) -> float:
-    """Part of the picture, left of the panel, that is as black as air in an image."""
+    """Return the fraction of the picture, left of the panel, as black as air in an image."""
     from PIL import Image
 
     page.wait_for_timeout(1000)
@@ -366,7 +366,7 @@ def test_effects_are_switched(page: Any, shots: Path) -> None:
 
 
 def settle(page: Any, misplaced: Callable[[], list[str]], tab: str) -> None:
-    """Wait until nothing is misplaced any more."""
+    """Wait until nothing is misplaced."""
     for _ in range(40):
         found = misplaced()
         if not found:
@@ -376,7 +376,7 @@ def settle(page: Any, misplaced: Callable[[], list[str]], tab: str) -> None:
 
 
 def misplaced(boxes: list[Any], width: int) -> list[str]:
-    """Controls that are missing, cut, or lie over others."""
+    """List controls that are missing, cut, or lie over others."""
     found = [] if len(boxes) >= len(TABS) else [f"{len(boxes)} controls"]
     found += [f"{b[0]} is cut" for b in boxes if b[1] < 0 or b[3] > width or b[2] < 0]
     for i, a in enumerate(boxes):
@@ -391,7 +391,7 @@ def misplaced(boxes: list[Any], width: int) -> list[str]:
 
 
 def begins_below_the_top(part: Any) -> bool:
-    """Not while it is drawn anew, when it has no box."""
+    """Return whether it begins below the top; not while it is drawn anew, without a box."""
     box = part.bounding_box()
     return box is not None and box["y"] > 0
 

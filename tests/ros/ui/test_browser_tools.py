@@ -1,4 +1,4 @@
-"""The planning page of a cell with two tools, in a real browser: both are moved, felt and kept."""
+"""The page of a cell with two tools, in a real browser: both are moved, pressed and recorded."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_tool_is_chosen_in_the_list_or_by_dragging_it(
 ) -> None:
     page.get_by_label("Tool", exact=True).wait_for()  # once the contact node was asked
     take(page, "left")
-    page.mouse.click(60, 700)  # nothing is there, and the list takes keys no more
+    page.mouse.click(60, 700)  # nothing is there, and the list takes no more keys
     look_beside(page)
     take(page, "right")
     pressed(page, 0.5, "right")

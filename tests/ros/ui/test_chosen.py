@@ -1,4 +1,4 @@
-"""Choices on the planning page: each reaches the cell once, and is taken back as a whole."""
+"""Choices on the planning page: each reaches the cell once, and is undone as a whole."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def answer_material(values: dict[str, float], report: Any, refused: Any) -> None
 
 
 def usable(material: dict[str, float]) -> dict[str, float]:
-    """Of all values, those that the organ holds."""
+    """Return the values that the organ holds."""
     return {
         name: material[name]
         for name, (low, high, _) in RANGES.items()
@@ -45,7 +45,7 @@ def usable(material: dict[str, float]) -> dict[str, float]:
 
 @pytest.fixture
 def cell() -> Noted:
-    """What page and nodes were asked for; it refuses a scene and a value."""
+    """Return a note of the requests to page and nodes; it refuses a scene and a value."""
     there = {"material.young_modulus": 90e3}
     return Noted(
         set_material=answer_material,
@@ -115,7 +115,7 @@ def test_a_material_that_is_refused_is_not_shown(chosen: Chosen) -> None:
 
 
 def test_what_another_client_sets_is_shown_once(chosen: Chosen, cell: Noted) -> None:
-    """As `avatar calibrate --set`; a user may be typing another value."""
+    """For example `avatar calibrate --set`; a user may be typing another value."""
     for _ in range(3):
         chosen.follow_contact({"material.young_modulus": 8e3, "uncertainty": ""})
     assert chosen.given == {"young": 8e3} and cell.of("show_material") == [{"young": 8e3}]
@@ -137,7 +137,7 @@ def test_of_a_slider_the_last_look_is_drawn(chosen: Chosen, cell: Noted) -> None
 def test_the_first_switch_of_a_scene_is_taken_back(
     chosen: Chosen, cell: Noted, cube: Organ
 ) -> None:
-    """By the effects and the tip that the contact node had been started with."""
+    """Effects and tip of the contact node's start return."""
     chosen.choose_scene("palpation")
     chosen.undo()
     assert chosen.scene == "palpation" and "does not say" in cell.of("say")[-2]

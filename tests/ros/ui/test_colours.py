@@ -1,4 +1,4 @@
-"""Colours of the organ on the planning page: bands, tone, smoothness, and what they show."""
+"""Colours of the organ on the planning page: bands, tone, smoothness, and their meaning."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_no_triangle_crosses_the_edge_of_a_band_and_none_is_lost(noise: float | 
     np.add.at(together, found.parent, vectors)  # turned round or missing, they would not add up
     np.testing.assert_allclose(together, given, atol=1e-12)
     turned = (vectors * given[found.parent]).sum(axis=1)
-    assert (turned > -1e-20).all()  # but for slivers as thin as rounding
+    assert (turned > -1e-20).all()  # except for slivers as thin as rounding
 
 
 def test_a_field_beyond_the_scale_is_in_the_last_band() -> None:
@@ -64,7 +64,7 @@ def test_a_field_beyond_the_scale_is_in_the_last_band() -> None:
 
 
 def test_the_browsers_tone_mapping_is_undone() -> None:
-    """Within rounding of 8 bits; of a few bright yellows, the nearest is known."""
+    """Within rounding of 8 bits; a few bright yellows get the nearest colour."""
     seen = np.vstack([band_colours(), tissue_colours()]).astype(float)
     np.testing.assert_allclose(tone.shown(tone.material(seen)), seen, atol=4.0)
     grey = np.repeat(np.arange(20.0, 230.0, 10.0)[:, None], 3, axis=1)
@@ -75,7 +75,7 @@ def test_the_browsers_tone_mapping_is_undone() -> None:
 
 
 class Shown:
-    """A page: what is painted and said, and what the contact node's parameter is."""
+    """Page with its painted fields and messages, and the contact node's parameter."""
 
     def __init__(self, parameter: str = "") -> None:
         self.page = Noted(in_executor=lambda do: do())

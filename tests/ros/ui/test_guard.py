@@ -1,4 +1,4 @@
-"""The planning page refuses whoever does not hold its token, and every other site."""
+"""The planning page refuses requests without its token, and those of every other site."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def cookie_of(port: int) -> str:
 
 
 def is_let_in(port: int, **headers: str) -> bool:
-    """Whether a WebSocket opens; the page drives the cell through it."""
+    """Return whether a WebSocket opens; the page drives the cell through it."""
     try:
         with connect(
             f"ws://127.0.0.1:{port}",
@@ -105,7 +105,7 @@ def test_another_site_is_refused_even_where_the_browser_sends_the_cookie(port, o
     "host", ["example.org", "example.org:8080", "127.0.0.1.example.org", "[", "127.0.0.1:x"]
 )
 def test_a_name_that_points_here_is_refused(port, host):
-    """A site may let its name point to 127.0.0.1; to the browser, the page is then the site's."""
+    """A site may point its name to 127.0.0.1; to the browser, the page is then the site's."""
     cookie = cookie_of(port)
     assert asked(port, f"/?token={TOKEN}", Host=host, Cookie=cookie).status == 403
 

@@ -1,4 +1,4 @@
-"""What is put into the page that viser serves."""
+"""Additions to the page that viser serves."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from avatar_ros.ui.server.index_page import BLUE, DIMMED, LIGHT_BLUE, TITLE, WAR
 from websockets import Headers, Response
 
 LEAST = 4.5  # contrast of text (WCAG 2.1, 1.4.3)
-WHITE, NIGHT = "#ffffff", "#242424"  # grounds of viser's panel, light and dark
+WHITE, NIGHT = "#ffffff", "#242424"  # backgrounds of viser's panel, light and dark
 
 
 def luminance(colour: str) -> float:
-    """Relative, of a colour #rrggbb (WCAG 2.1)."""
+    """Return the relative luminance of a colour #rrggbb (WCAG 2.1)."""
     rgb = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     return float(linear @ (0.2126, 0.7152, 0.0722))

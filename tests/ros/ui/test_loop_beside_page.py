@@ -28,14 +28,14 @@ from tests.ros.helpers.browser import (
     until,
 )
 
-# A browser that draws without a graphics card takes both cores.
+# a browser that draws without a graphics card takes both cores
 pytestmark = [pytest.mark.long, pytest.mark.timing]
 
-DEEP = -0.002  # of the tip's centre over the surface, while it presses [m]
-ENOUGH = 3.0  # force that stays one while the tool swings [N]
-SWING = 10.0  # of the mouse [px]
+DEEP = -0.002  # height of the tip's centre over the surface, while it presses [m]
+ENOUGH = 3.0  # force that remains while the tool swings [N]
+SWING = 10.0  # way of the mouse [px]
 SECONDS = 6.0  # of a measurement
-PRIORITY = 80  # of the loop: without one, cores are shared by whoever runs
+PRIORITY = 80  # of the loop: without one, all processes share the cores
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def contact() -> list[str]:
 
 
 def figures(probe: Probe, meanwhile: Callable[[], None]) -> np.ndarray:
-    """Rate [Hz] and share of the periods on time: medians of the windows."""
+    """Return rate [Hz] and fraction of periods on time: medians of the windows."""
     windows: list[tuple[float, float]] = []
 
     def note(window: LoopStatistics) -> None:
@@ -65,10 +65,10 @@ def figures(probe: Probe, meanwhile: Callable[[], None]) -> np.ndarray:
 def test_the_loop_keeps_its_figures_while_the_page_is_dragged(
     page: Any, shown: Organ, nodes: dict[str, Module], lasting_probe: Probe
 ) -> None:
-    """In turns, since a machine's neighbours come and go; the tool presses all the time.
+    """Measured in turns, since a machine's neighbours come and go; the tool presses all the time.
 
-    A planner's browser draws on his own machine: what it takes from the loop on this one is not
-    what the page's node takes, so that it draws in both halves.
+    A planner's browser draws on another machine. Its load on this one does not count as that of
+    the page's node, so the browser draws in both halves.
     """
     drag(page, shown, 0.020, DEEP)
     page.mouse.up()
@@ -92,7 +92,7 @@ def test_the_loop_keeps_its_figures_while_the_page_is_dragged(
 
 @contextmanager
 def stopped(node: Module) -> Iterator[None]:
-    """A node that stands still meanwhile."""
+    """Stop a node meanwhile."""
     node.send_signal(signal.SIGSTOP)
     try:
         yield
@@ -101,14 +101,14 @@ def stopped(node: Module) -> Iterator[None]:
 
 
 def dragged(page: Any, shown: Organ, probe: Probe) -> np.ndarray:
-    """Figures while the mouse swings the tool about where it presses."""
+    """Measure while the mouse swings the tool about where it presses."""
     found = swung(page, shown, probe)
     until(page, lambda: force_of(page) > 0.05, "a force after it swung", 20.0)
     return found
 
 
 def swung(page: Any, shown: Organ, probe: Probe) -> np.ndarray:
-    """Figures while the mouse swings about the tool, whether or not the page's node follows."""
+    """Measure while the mouse swings about the tool, whether or not the page's node follows."""
     x, y = screen_of(page, beside_pose(shown), shown.above(DEEP))
     swing = iter(SWING * np.sin(np.arange(100_000) / 5.0))
     page.mouse.move(x, y)
@@ -120,7 +120,7 @@ def swung(page: Any, shown: Organ, probe: Probe) -> np.ndarray:
 
 
 def test_a_browser_that_is_slow_shows_what_is_now(page: Any, shown: Organ) -> None:
-    """With a tenth of its processor; it neither lags nor hoards what it has not drawn."""
+    """With a tenth of its processor it neither lags nor stores pictures not drawn yet."""
     browser = page.context.new_cdp_session(page)
     heap = []
     drag(page, shown, 0.020, DEEP)

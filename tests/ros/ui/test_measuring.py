@@ -1,4 +1,4 @@
-"""Lengths, depths, gaps and margins of the planning page, on bodies whose answer is known."""
+"""Lengths, depths, gaps and margins of the planning page, on bodies with known answers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.ros.helpers.page import Noted
 
 RADIUS = 0.05
 POINTS, FACES = ball(2000, RADIUS)
-FACETS = 4e-4  # between the ball and its facets, at most [m]
+FACETS = 4e-4  # largest distance between the ball and its facets [m]
 
 
 def test_a_click_finds_the_near_side() -> None:
@@ -80,7 +80,7 @@ def test_three_points_on_a_line_are_no_plane() -> None:
     assert is_plane(0.05 * np.eye(3))
 
 
-# --- What was placed --------------------------------------------------------------------------
+# --- Places -----------------------------------------------------------------------------------
 
 CORNERS = np.array([[0.05, 0.2, 0.05], [0.15, 0.2, 0.05], [0.1, 0.2, 0.15]])
 

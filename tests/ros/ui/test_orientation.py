@@ -23,7 +23,7 @@ from avatar_ros.ui.view.orientation import (
 from avatar_core.geometry.surface import read_surface
 from tests.helpers.small_files import ball
 
-# Where the axes of a file point, as a rotation from RAS.
+# directions of a file's axes, as a rotation from RAS
 TURNS = {
     "RAS": np.diag([1.0, 1.0, 1.0]),
     "LPS": np.diag([-1.0, -1.0, 1.0]),
@@ -35,7 +35,7 @@ NO_TIPS = np.zeros((0, 3))
 
 
 def lopsided() -> tuple[np.ndarray, np.ndarray]:
-    """A ball with a bump at the patient's right, RAS [mm]."""
+    """Return a ball with a bump at the patient's right, RAS [mm]."""
     points, faces = ball(500, 50.0)
     bump = np.exp(-((points - [50.0, 0.0, 0.0]) ** 2).sum(axis=1) / 15.0**2)
     return points * (1.0 + 0.6 * bump[:, None]), faces
@@ -66,7 +66,7 @@ def test_a_standard_view_comes_from_its_side(side: str) -> None:
 
 
 def in_picture(pose: Pose, point: np.ndarray) -> np.ndarray:
-    """Where a point is, over the height of the picture."""
+    """Return where a point is, relative to the height of the picture."""
     right, up, towards = basis(pose)
     depth = (pose.position - point) @ towards
     return np.array([point @ right, point @ up]) / (2.0 * np.tan(0.5 * FOV) * depth)
@@ -75,7 +75,7 @@ def in_picture(pose: Pose, point: np.ndarray) -> np.ndarray:
 def seen_from(
     pose: Pose, vertices: np.ndarray, tips: np.ndarray = NO_TIPS, aspect: float = 1.0
 ) -> dict[str, np.ndarray]:
-    """Letters that are drawn, with their places in the picture over its height."""
+    """Return drawn letters, with their places in the picture relative to its height."""
     middle = scale_bar(pose, FOV, float(np.ptp(vertices, axis=0).max()))[1].mean(axis=0)
     seen = {"scale": middle} | seen_letters(vertices, pose, FOV, middle, tips, aspect)
     return {letter: in_picture(pose, place) for letter, place in seen.items()}
@@ -92,7 +92,7 @@ def test_a_standard_view_has_the_letters_of_its_four_sides(side: str) -> None:
 @pytest.mark.parametrize("aspect", [0.6, 0.8, 1.0, 1.6])
 @pytest.mark.parametrize("side", AXES)
 def test_the_letters_of_a_narrow_picture_are_not_cut(side: str, aspect: float) -> None:
-    """Around a long organ; where a tool takes its place, a letter may be missing."""
+    """A long organ; if a tool takes its place, a letter may be missing."""
     vertices = 1e-3 * ball(500, 50.0)[0] * [2.0, 1.6, 1.4]
     pose = standard_view(side, np.zeros(3), 0.2, aspect)
     half = 0.025  # of a letter
@@ -111,7 +111,7 @@ def test_letters_lie_over_nothing(turn: float, distance: float) -> None:
     along, height = np.radians(turn), 0.3
     towards = np.array([np.cos(along), np.sin(along), height]) / np.hypot(1.0, height)
     pose = Pose(distance * towards, np.zeros(3), np.array(AXES["S"]))
-    tips = label_places(vertices)["A"][None]  # where else a letter would be
+    tips = label_places(vertices)["A"][None]  # where a letter would otherwise be
     found = seen_from(pose, vertices, tips)
     for letter in set(found) - {"scale"}:
         across, up = np.abs(found[letter] - in_picture(pose, tips[0]))

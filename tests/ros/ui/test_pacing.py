@@ -33,14 +33,14 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[viser.ViserServer]:
 
 @pytest.fixture
 def browser(server: viser.ViserServer) -> Iterator[ClientConnection]:
-    """Speaks as viser's page does, but runs no JavaScript."""
+    """Speak as viser's page does, but run no JavaScript."""
     address = f"ws://127.0.0.1:{server.get_port()}/?token={TOKEN}"
     with connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None) as found:
         yield found
 
 
 def window(browser: ClientConnection) -> list[dict[str, Any]]:
-    """Messages that came together; TimeoutError if none does within half a second."""
+    """Return messages that came together; TimeoutError if none does within half a second."""
     data = browser.recv(timeout=0.5)
     plain, packed = (int.from_bytes(data[k : k + 8], "little") for k in (0, 8))
     text = zstandard.ZstdDecompressor().decompress(data[16 : 16 + packed], plain)

@@ -28,9 +28,9 @@ from tests.ros.helpers.page import AtOnce, Noted, face_area, image
 
 
 class Cell(Noted):
-    """Builds a result at once; notes what is asked of it, and what tab and view show.
+    """Stand-in that builds at once; it notes requests, and the state of tab and view.
 
-    drawn : regions of the faces, of each time the preview was drawn
+    drawn : regions of the faces, for each drawing of the preview
     springs : areas that the tab shows [m^2]
     """
 
@@ -55,13 +55,13 @@ class Cell(Noted):
 
     @property
     def asked(self) -> Wanted:
-        """For the last build."""
+        """Return the request of the last build."""
         return self.of("build_patient")[-1]
 
 
 @pytest.fixture
 def cell(cube: Organ) -> Cell:
-    """The surface of a cube's mesh, clamped and reached as its vademecum."""
+    """Return the surface of a cube's mesh, clamped and reached as its vademecum."""
     at = cube.vademecum.regions
     regions = np.where(at.accessible, ACCESSIBLE, 0)
     regions[at.clamped] = CLAMPED
@@ -77,7 +77,7 @@ def new(cell: Cell, tmp_path: Path) -> NewPatient:
 
 
 def towards(cube: Organ, face: int) -> tuple[np.ndarray, np.ndarray]:
-    """A ray from outside to the middle of a face of the cube."""
+    """Return a ray from outside to the middle of a face of the cube."""
     corners = cube.vertices[cube.faces[face]].astype(float)
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
     normal /= np.linalg.norm(normal)
@@ -127,7 +127,7 @@ def test_springs_are_painted_by_name_and_kept_for_the_build(
         preview=True,
     )
     new.build(wanted)
-    assert list(cell.springs) == ["cava_groove", "falciform"]  # what is clamped is no spring
+    assert list(cell.springs) == ["cava_groove", "falciform"]  # a clamp is no spring
     assert cell.springs["cava_groove"] == 0.0
     assert cell.springs["falciform"] == pytest.approx(
         face_area(cube.vertices, cube.faces[free[:2]]), rel=1e-5
@@ -147,7 +147,7 @@ def test_springs_are_painted_by_name_and_kept_for_the_build(
     new.paint(*towards(cube, free[-1]))  # with the same brush, whose number is another now
     assert cell.drawn[-1][free[-1]] == FIRST_SPRING + 1
     new.build(wanted._replace(preview=False, supports=()))
-    assert cell.asked.groups == ""  # springs were painted, and a clamp is asked for
+    assert cell.asked.groups == ""  # springs were painted, and a clamp is requested
 
 
 def test_a_patient_that_was_built_is_offered_and_the_organ_in_use_stays(
@@ -224,7 +224,7 @@ def tab(server: ViserServer, user: Noted) -> PatientTab:
 
 def test_labels_of_a_file_reach_the_build(tab: PatientTab, user: Noted) -> None:
     tab.offer(["case.nii.gz", "liver.stl"])
-    assert user.of("choose_surface") == []  # a scan is no patient that somebody asked for
+    assert user.of("choose_surface") == []  # a scan is not a patient that a user chose
     tab._ask()
     assert user.of("build") == [] and "choose a surface" in tab._stage.content
     tab._surfaces.value = "case.nii.gz"

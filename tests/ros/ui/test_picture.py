@@ -1,4 +1,4 @@
-"""What a browser shows of the organ: the colours of the legend, and left on its side.
+"""Colours and sides in the browser: they agree with the legend and the patient.
 
 The view alone, without nodes: a known displacement is drawn, and pixels are read.
 """
@@ -22,8 +22,8 @@ from tests.ros.helpers.browser import browsing, close_notices, first_pose, scree
 
 pytestmark = pytest.mark.long
 
-TOP = 5e-3  # of the field that is drawn [m]
-CLOSE = 0.05 * 255  # of a colour to that of the legend
+TOP = 5e-3  # largest value of the drawn field [m]
+CLOSE = 0.05 * 255  # distance of a colour from that of the legend
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def browser(chromium: str, viser_server: ViserServer, view: OrganView) -> Iterat
 
 
 def picture(page: Any) -> np.ndarray:
-    """Pixels, shape (down, right, 3), once they no longer change."""
+    """Return pixels, shape (down, right, 3), once they no longer change."""
     from PIL import Image
 
     before = np.zeros(1)
@@ -59,7 +59,7 @@ def picture(page: Any) -> np.ndarray:
 
 
 def ramp(cube: Organ) -> np.ndarray:
-    """A cloud that moves along z by more the farther to the patient's right, 0 to TOP [m]."""
+    """Return a cloud displaced along z, from 0 to TOP towards the patient's right [m]."""
     rest = cube.vertices.astype(float)
     x = rest[:, 0]
     moved = np.zeros_like(rest)
@@ -70,7 +70,7 @@ def ramp(cube: Organ) -> np.ndarray:
 def test_pixels_have_the_colours_of_the_legend_and_right_is_on_the_left(
     view: OrganView, browser: Any, cube: Organ, shots: Path
 ) -> None:
-    """Seen from the front, the patient's right is at the left: there the field is largest."""
+    """From the front, the patient's right is at the left: there the field is largest."""
     cloud = ramp(cube)
     view.move(cloud)
     pixels, pose = picture(browser), first_pose(cube)
@@ -120,7 +120,7 @@ def test_glass_has_no_dark_patch_and_rest_is_tissue(
     assert (np.abs(whole / whole.sum(axis=1, keepdims=True) - red / red.sum()) < 0.05).all()
     view.look(GLASS)
     glass = seen()
-    assert (glass > whole).any(axis=1).all() and glass.min() > 120  # lighter before white ground
+    assert (glass > whole).any(axis=1).all() and glass.min() > 120  # lighter on a white background
     assert np.ptp(glass.sum(axis=1)) < 90
     view.look(CUT, "A", 0.5)
     cut = seen()

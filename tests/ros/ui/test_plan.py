@@ -1,4 +1,4 @@
-"""What a planner keeps: states by organ, undone changes, a report, and surfaces to take away."""
+"""Plans: states by organ, undone changes, a report, and exported surfaces."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_the_last_change_is_undone_and_a_drag_as_one(monkeypatch: pytest.MonkeyP
 
 @pytest.fixture
 def page() -> Noted:
-    """Where labels are offered and lines are said."""
+    """Return a note of offered labels and messages."""
     return Noted()
 
 
@@ -196,11 +196,11 @@ def test_a_report_holds_numbers_errors_and_notes(plan: Plan, page: Noted, tmp_pa
     ):
         assert part in text
     assert "<the>" not in text and "not a medical device" in text
-    assert "error of the force" not in text  # but the one beside it
+    assert "error of the force" not in text  # except the one beside it
 
 
 class Browser:
-    """A client that draws a grey picture of the size that it is asked for."""
+    """Client that draws a grey picture of the requested size."""
 
     camera = None
 
@@ -267,7 +267,7 @@ def test_the_plane_of_the_cut_is_written_as_a_resection(
     opens: list[int],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Where it was seen: a quarter of the organ's width from that side."""
+    """The cut lies where it was seen: a quarter of the organ's width from that side."""
     monkeypatch.setattr(plan, "_now", lambda: replace(now, look=("cut open", side, 0.25)))
     plan.resect()
     (path,) = tmp_path.glob("resection-*.json")

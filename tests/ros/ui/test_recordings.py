@@ -1,4 +1,4 @@
-"""Recordings of the planning page: when one begins and ends, what it says, and how it plays."""
+"""Recordings of the planning page: begin and end, messages, and playing."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_recording_ends_where_nothing_more_is_kept(state: SharedToolState) -> 
 def test_a_recording_without_a_surface_is_written(
     state: SharedToolState, cube: Organ, tmp_path: Path
 ) -> None:
-    """Of a contact node that sends none."""
+    """The contact node sends no surface."""
     recorder = Recorder(state)
     recorder.open(cube.vademecum, Scene(effects=()), 1000.0)
     state.all["n_rows"] = 7
@@ -104,13 +104,13 @@ def test_a_recording_says_what_it_lacks(cube: Organ) -> None:
 
 
 def then(cube: Organ) -> Scene:
-    """What ran when it was recorded."""
+    """Return the scene of the recording."""
     effects = default_effects(cube.vademecum, (Tip(),))
     return Scene(name="then", tools=(Tool(),), effects=effects, young_modulus=50e3)
 
 
 def one_tool(**given: np.ndarray) -> Any:
-    """A force that grows by 0.01 N a period, and a cloud by 0.01 mm."""
+    """Return a recording with a force that grows by 0.01 N a period, and a cloud by 0.01 mm."""
     number = np.arange(1000, 1200)
     force = np.zeros((200, 1, 3))
     force[:, 0, 1] = 0.01 * np.arange(200)
@@ -152,7 +152,7 @@ def test_a_recording_is_scrubbed_and_each_state_is_one_period(
 def test_beyond_the_range_a_recording_shows_what_was_shown(
     cube: Organ, player: Player, tmp_path: Path
 ) -> None:
-    """The last valid shape and why there is no force; nothing where the tool never touched."""
+    """The last valid shape with the reason for no force; nothing if the tool never touched."""
     of, moved = one_tool()
     of.status[[0, 1]] = of.status[100:] = OUT
     of.tip[120:] = 1e3  # no pose was used

@@ -1,4 +1,4 @@
-"""Requests of the planning page, which its users make in threads of the page's own."""
+"""Requests of the planning page, which its users make in separate threads."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from avatar_ros.action import BuildPatient
 from tests.ros.conftest import Probe
 from tests.ros.helpers.page import Noted
 
-AWAY = 0.5  # of a thread, right after it sent a goal: the answer comes meanwhile [s]
+AWAY = 0.5  # pause of a thread right after it sent a goal: the answer comes meanwhile [s]
 
 
 class Slow:
@@ -49,7 +49,7 @@ def build_at_once(goal: Any) -> BuildPatient.Result:
 
 @pytest.fixture
 def until_built(probe: Probe) -> Iterator[Callable[[list[Any], list[str]], None]]:
-    """Asks for a patient in a thread of its own, and spins until there is a result."""
+    """Ask for a patient in a separate thread, and spin until there is a result."""
     requests = Requests(probe.node)
 
     def ask(results: list[Any], said: list[str]) -> None:
@@ -79,7 +79,7 @@ def test_the_end_of_a_build_is_heard_however_early_the_goal_is_accepted(until_bu
 
 
 class Silent:
-    """A client of a node that ends before it answers."""
+    """Client of a node that ends before it answers."""
 
     def __init__(self) -> None:
         self.asked: list[float] = []
@@ -121,7 +121,7 @@ def test_a_scene_that_is_being_prepared_is_said_until_it_is_in_use() -> None:
 
 
 def building() -> tuple[Requests, list[Any], list[str]]:
-    """A build that is under way; its results, and what was said."""
+    """Return a running build, its results, and its messages."""
     requests, results, said = Requests.__new__(Requests), [], []
     ready = SimpleNamespace(
         server_is_ready=lambda: True,

@@ -1,4 +1,4 @@
-"""Images lie in the patient, and lines show where planes cut the organ as it is now."""
+"""Images lie in the patient, and lines show where planes cut the organ at present."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ORIGIN = np.array([-40.0, 12.0, 70.0])  # of the first slice of a series, LPS [m
 
 @pytest.fixture
 def user() -> Noted:
-    """What a user asks for, and what is said to him."""
+    """Return a note of requests and messages."""
     return Noted()
 
 
@@ -50,13 +50,13 @@ def planes(server: ViserServer, tmp_path: Path, tab: ScanTab, user: Noted) -> Sc
 
 
 def loops(segments: np.ndarray) -> set[int]:
-    """How many segments meet at each end."""
+    """Count the segments that meet at each end."""
     ends = Counter(tuple(end) for end in np.round(segments.reshape(-1, 3), 9))
     return set(ends.values())
 
 
 def test_a_plane_through_corners_leaves_no_gap() -> None:
-    """Of an octahedron, four corners lie in the plane."""
+    """Four corners of an octahedron lie in the plane."""
     points = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
     faces = np.array(
         [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
@@ -243,9 +243,9 @@ def test_an_image_that_comes_late_is_not_drawn_in_the_next_organ(
 
 
 def dicom_series(folder: Path) -> np.ndarray:
-    """Five oblique slices of 6 x 8 pixels, 4 mm apart; returns the place of one that is bright.
+    """Write five oblique slices of 6 x 8 pixels, 4 mm apart; return the place of a bright one.
 
-    In RAS [m], by equation C.7.6.2.1-1 of the standard.
+    It is in RAS [m], by equation C.7.6.2.1-1 of the standard.
     """
     pydicom = pytest.importorskip("pydicom", reason="highdicom is missing: '.[dicom]'")
     from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid

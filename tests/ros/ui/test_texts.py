@@ -1,4 +1,4 @@
-"""What the planning page writes of a period and draws with it: its own force, and no other."""
+"""Numbers that the planning page writes and draws for a period: its own force, and no other."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from avatar_core.vademecum.model import VademecumInfo
 from avatar_ros.msg import ContactState
 from tests.ros.helpers.page import NAMES, OK, OUT, PLACES, TIP, Noted, rows, send
 
-# Statuses of a period whose step computed no force, though the tool may press.
+# statuses of a period whose step computed no force, though the tool may press
 NO_FORCE = (OUT, ContactState.STATUS_SLOW_POSES, ContactState.STATUS_LEAP)
 
 
@@ -54,7 +54,7 @@ def shown(force: float, error: float, largest: float) -> ShownPeriod:
 
 
 def info(error: float) -> VademecumInfo:
-    """Of a vademecum with an expected error of its displacement."""
+    """Return the info of a vademecum with an expected error of its displacement."""
     values: dict[str, Any] = {field.name: 0 for field in fields(VademecumInfo)}
     return VademecumInfo(**values | {"l2_mean": error, "force_mean": 0.01})
 
@@ -70,7 +70,7 @@ def chooser() -> PeriodChooser:
 def drawn(
     chooser: PeriodChooser, now: np.ndarray, largest: float = 1e-3
 ) -> tuple[ShownPeriod, ...]:
-    """What is shown of a period, with a cloud of a largest displacement [m]."""
+    """Return the shown numbers of a period, with a cloud of a largest displacement [m]."""
     chooser.take(now)
     return chooser.drawn(now, largest, PLACES[: len(now)])
 
@@ -79,7 +79,7 @@ def drawn(
 def test_no_device_is_spoken_of_at_tools_that_the_page_moves(
     chooser: PeriodChooser, status: int
 ) -> None:
-    """What a device would get, limited or while the force is faded in, nobody gets here."""
+    """A device's force would be limited or faded in; the page shows the organ's own."""
     now = rows((status, 25.0))
     now["sent_fraction"] = 0.0
     (period,) = drawn(chooser, now, 0.0071)
@@ -89,7 +89,7 @@ def test_no_device_is_spoken_of_at_tools_that_the_page_moves(
 
 
 def test_no_displacement_is_not_none() -> None:
-    """Without a surface from the contact node, 20 N stand beside no 0.0 mm."""
+    """Without a surface from the contact node, 20 N do not stand beside 0.0 mm."""
     text = " ".join(frame_text(shown(20.0, 1.0, float("nan")), "", None))
     assert "20.00 N" in text and "mm" not in text and "sends no surface" in text
 
@@ -113,7 +113,7 @@ def test_the_force_of_a_stamp_is_that_or_none(state: SharedToolState) -> None:
     assert np.isnan(state.force_of(0, 8))
 
 
-# --- What is shown of a period ----------------------------------------------------------------
+# --- Shown numbers of a period ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("status", NO_FORCE)
@@ -195,11 +195,11 @@ def test_what_is_extrapolated_on_another_tool_is_not_missed(chooser: PeriodChoos
     shown = drawn(chooser, rows((OK, 1.0), (ContactState.STATUS_EXTRAPOLATED, 25.0)))
     expected = "Extrapolated: beyond the computed range; do not rely on the force"
     assert alerts(EXACT, (), shown, NAMES) == [f"right: {expected}"]
-    assert alerts(EXACT, (), [shown[1], shown[1]], NAMES) == [expected]  # of both: said once
+    assert alerts(EXACT, (), [shown[1], shown[1]], NAMES) == [expected]  # of both tools: shown once
 
 
 def test_a_patient_of_large_expected_error_is_marked() -> None:
-    """Interpolated patients are 16 % wrong; what was never measured is no better."""
+    """Interpolated patients are 16 % wrong; an unmeasured error is no better."""
     now = shown(0.0, 0.0, 0.0)
     (alert,) = alerts(info(0.16), (), [now])
     assert alert.startswith("Large expected error of displacement:")
@@ -259,7 +259,7 @@ def test_organs_are_told_apart_by_their_ids() -> None:
     rows((OK, 1.0), organ=organ_number(64 * "f"))  # fits
 
 
-# --- The band of what is known ----------------------------------------------------------------
+# --- The band of the material's distributions -------------------------------------------------
 
 
 def test_the_page_shows_a_band_in_proportion_to_the_force_beside_it() -> None:
@@ -335,7 +335,7 @@ def test_scenes_are_those_of_as_many_tools_and_how_to_come_to_the_others_is_said
 
 
 def test_a_name_is_no_html(cube: Organ) -> None:
-    """Anybody may have named an organ, and a page that ran it would move the tool for them."""
+    """Anybody may have named an organ; a page that ran its name would move the tool for them."""
     named = replace(cube, name="<img src=x onerror=alert(1)>")
     assert "<img" not in named.summary() and "&lt;img" in named.summary()
     page: Any = SimpleNamespace(_banner=SimpleNamespace(content=""))

@@ -31,8 +31,8 @@ from tests.helpers.slowness import Deadline, wait_until
 from tests.ros.conftest import PATIENT, START_TIMEOUT, Probe
 from tests.ros.helpers.page import NAMES, OK, PLACES
 
-APART = 0.02  # of two tips on the organ [m]
-DEPTH = 0.003  # to which they press [m]
+APART = 0.02  # distance of two tips on the organ [m]
+DEPTH = 0.003  # depth to which they press [m]
 
 
 # --- The driver -------------------------------------------------------------------------------
@@ -51,7 +51,7 @@ def driven(
 def test_it_has_no_shared_memory(
     state: SharedToolState, own_domain: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Through it, any process that joins can hold up its poses for a third of a second."""
+    """Through it, any process that joins can delay its poses for a third of a second."""
     as_page: dict[str, str] = {}
     stay_local(as_page)
     for name, value in as_page.items():
@@ -100,7 +100,7 @@ def test_poses_of_all_tools_are_of_one_time_and_each_goes_its_way(
 
 
 def answer(tool: str, step: int, force: float) -> Any:
-    """A ContactState of a step, at 1 kHz."""
+    """Return a ContactState of a step, at 1 kHz."""
     stamp = SimpleNamespace(sec=0, nanosec=1000 * (step + 1))
     contact = SimpleNamespace(force=SimpleNamespace(x=0.0, y=force, z=0.0))
     return SimpleNamespace(
@@ -116,12 +116,12 @@ def answer(tool: str, step: int, force: float) -> Any:
 
 
 def used(tool: int, _status: int, stamp: int) -> np.ndarray:
-    """A place that tells tool and pose."""
+    """Return a place that encodes tool and pose."""
     return np.full(3, tool + 1e-9 * stamp)
 
 
 def test_a_period_has_the_states_of_one_step_or_is_lost(state: SharedToolState) -> None:
-    """Of step 2 the first state is lost, of step 4 the last one; the count goes on."""
+    """The first state of step 2 and the last one of step 4 are lost; the count goes on."""
     state.all["recording"] = 1
     periods = PeriodCollector(NAMES, NAMES, state, used)
     number = 1
@@ -158,7 +158,7 @@ def test_beside_a_device_the_states_of_its_tool_are_passed_over(state: SharedToo
 def cell(
     own_domain: dict[str, str], library: Path
 ) -> Iterator[tuple[SharedToolState, Callable[[], None]]]:
-    """The contact node with the shipped scene of two tools, and the page's driver of both."""
+    """Run the contact node with the shipped scene of two tools, and the page's driver of both."""
     words = ["-p", "tools:=[left,right]", "-p", "scene:=two_tools"]
     files = ["-p", f"library_dir:={library}", "-p", "vademecum:=liver.h5"]
     processes = {

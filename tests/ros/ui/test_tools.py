@@ -1,4 +1,4 @@
-"""Several tools on the planning page: which one is chosen, and what moves it."""
+"""Several tools on the planning page: the chosen one, and its motion."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_drag_chooses_its_tool_and_keys_move_that_one(tools: Tools) -> None:
 
 
 def test_an_undone_drag_is_that_of_the_tool_that_was_moved(tools: Tools) -> None:
-    """Drags of two tools within a second are two."""
+    """Drags of two tools within a second are two changes."""
     for tool in (0, 1):
         for way in (0.1, 0.2, 0.3):
             tools.drag(tool, PLACES[tool], np.full(3, way), along_shaft=False)
@@ -71,7 +71,7 @@ def test_one_tool_has_no_name_to_be_said(tools: Tools) -> None:
 
 
 def tools_at(state: SharedToolState, organ: Organ, place: np.ndarray) -> tuple[Tools, History]:
-    """One tool, and the history of its places."""
+    """Return one tool, and the history of its places."""
     history = History()
     tools = Tools(state, history, lambda: organ)
     tools.use(("tool",), place[None])
@@ -79,7 +79,7 @@ def tools_at(state: SharedToolState, organ: Organ, place: np.ndarray) -> tuple[T
 
 
 def gone(tools: Tools) -> list[np.ndarray]:
-    """Places that a tool passes which is at once where it is sent."""
+    """Return the places that a tool passes if it reaches each target at once."""
     passed = [tools.targets[0]]
     for _ in range(12):
         tools.advance()
@@ -89,7 +89,7 @@ def gone(tools: Tools) -> list[np.ndarray]:
 
 
 def inside(organ: Organ, places: np.ndarray, deep: float = 0.0) -> bool:
-    """Whether straight ways between places pass the box, deeper than so much [m]."""
+    """Return whether straight ways between places pass the box, deeper than this [m]."""
     ways = [np.linspace(a, b, 200) for a, b in itertools.pairwise(places)]
     low, high = organ.vertices.min(axis=0) + deep, organ.vertices.max(axis=0) - deep
     return any(((low < one) & (one < high)).all() for way in ways for one in way)
@@ -119,7 +119,7 @@ def test_a_tool_goes_around_the_organ_and_not_through_it(
 def test_an_undone_change_of_place_leads_around_the_organ(
     state: SharedToolState, cube: Organ, deep: float, far: bool
 ) -> None:
-    """A kept state is put by the same method. As deep as it was, but no deeper on its way."""
+    """A kept state is restored by the same method: as deep as it was, no deeper on the way."""
     begin = np.array([0.05, 0.2 - deep, 0.1])
     there = begin + ([0.145, -0.1, 0.0] if far else [0.0, 5e-3, 0.0])
     tools, history = tools_at(state, cube, begin)
@@ -169,7 +169,7 @@ def test_tools_are_offered_only_where_there_are_several(tab: Any, user: Noted) -
     tab.show_tools(NAMES, "right")
     assert len(tab._forces) == 1
     tab.show_tools(NAMES, "left")
-    assert len(tab._forces) == 0  # the curve of another tool is not gone on with
+    assert len(tab._forces) == 0  # the curve of another tool is not continued
     tab._on_tool(SimpleNamespace(client=None))  # not a user's
     assert user.calls == []
     tab._tools.value = "right"  # by a user, whose choice has not been taken yet

@@ -1,4 +1,4 @@
-"""Files that a browser sends: checked, bounded, and never in place of another."""
+"""Files that a browser sends: checked, limited in size, and never replacing another."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture
 def sent(tmp_path: Path) -> dict[str, bytes]:
-    """Sound files by name."""
+    """Return valid files by name."""
     own = tmp_path / "own"
     own.mkdir()
     save_vademecum(organ("cube"), own / "cube.h5")

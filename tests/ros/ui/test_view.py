@@ -1,4 +1,4 @@
-"""What the planning page draws of organ and tools, as it is sent to the browser."""
+"""Drawings of organ and tools on the planning page, as sent to the browser."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def pressed() -> ContactData:
 
 
 def meshes(view: OrganView, group: str) -> list[Any]:
-    """Those of a group that are not empty, which are the face 0, 0, 0 alone."""
+    """Return the meshes of a group that are not empty; empty ones have only face 0, 0, 0."""
     nodes = view._surface._nodes.items()
     return [mesh for (name, _), mesh in nodes if name == group and np.any(mesh.faces)]
 
@@ -85,7 +85,7 @@ def test_under_a_tip_that_presses_the_page_draws_the_dent_of_the_cloud(view: Org
 
 
 def test_at_rest_the_organ_is_tissue_whole_and_once(view: OrganView, cube: Organ) -> None:
-    """Cut into shades, and nothing over it."""
+    """It is cut into shades, and nothing lies over it."""
     assert meshes(view, "bands") == []
     exact = face_area(cube.vertices, cube.faces)
     assert area(meshes(view, "tissue")) == pytest.approx(exact, rel=0.05)
@@ -109,7 +109,7 @@ def test_the_same_cloud_is_not_sent_twice(view: OrganView, pressed: ContactData)
     first.vertices = np.zeros_like(first.vertices)
     assert view.move(pressed.out.cloud.copy()) == largest
     assert not np.any(first.vertices)
-    for held in (True, False):  # no number stands beside a shape that is not of now
+    for held in (True, False):  # no number stands beside a shape that is not the present one
         view.grey(held)
         assert view._marker.visible != held
 
@@ -149,7 +149,7 @@ def test_a_click_on_a_tool_is_none_on_the_organ_behind_it(view: OrganView, cube:
     across = np.cross(UP, np.eye(3)[2])
 
     def clicked(aside: float) -> bool:
-        """Whether the organ is, by a ray along the surface's normal."""
+        """Return whether the organ was clicked, by a ray along the surface's normal."""
         return view.clicked(eye + aside * across, -UP) is not None
 
     radius = SPHERE.radius
@@ -162,7 +162,7 @@ def test_a_click_on_a_tool_is_none_on_the_organ_behind_it(view: OrganView, cube:
 
 
 def shades(view: OrganView, first: int) -> list[Any]:
-    """Meshes of tissue that are no shades, from one beyond these on, and not empty."""
+    """Return non-empty meshes of tissue beyond the shades, from one of them on."""
     nodes = view._surface._nodes
     beyond = [nodes["tissue", k] for k in range(N_SHADES + first, N_TONES)]
     return [mesh for mesh in beyond if np.any(mesh.faces)]
@@ -180,7 +180,7 @@ def test_what_is_cut_away_is_not_clicked(view: OrganView) -> None:
 
 
 def test_the_clamp_has_checks_and_access_has_stripes(view: OrganView, cube: Organ) -> None:
-    """Both kinds of checks together are the clamp; stripes lie where tools reach, if asked for."""
+    """Both kinds of checks together are the clamp; stripes lie where tools reach, on request."""
     whole = area(meshes(view, "tissue"))
     clamp = face_area(cube.vertices, cube.faces[cube.clamped])
     dark, light = shades(view, 0)
@@ -196,7 +196,7 @@ def test_the_clamp_has_checks_and_access_has_stripes(view: OrganView, cube: Orga
 
 
 def test_what_springs_hold_is_hatched(view: OrganView) -> None:
-    """And nothing else changes; the legend names it then alone."""
+    """Nothing else changes; the legend names springs only then."""
     cube = organ("cube")
     held = np.zeros(len(cube.regions.clamped), bool)
     held[np.flatnonzero(~cube.regions.clamped & ~cube.regions.accessible)[:60]] = True
@@ -218,7 +218,7 @@ def test_the_legend_says_where_colours_of_glass_hold() -> None:
 
 
 def test_little_error_looks_unlike_no_access(view: OrganView, cube: Organ) -> None:
-    """A face with an error is in a band, the first one too; one without stays tissue."""
+    """A face with an error is in a band, the first one too; a face without stays tissue."""
     errors = np.full(len(cube.vertices), np.nan)
     reached = cube.faces[cube.accessible]
     errors[np.unique(reached)] = 0.5e-3  # half a band of a scale to 2 %
@@ -274,7 +274,7 @@ def test_a_held_shape_is_grey_until_it_is_that_of_now(view: OrganView) -> None:
 
 @pytest.mark.parametrize("depth", [-5e-3, 4e-3, 25e-3])
 def test_a_tool_is_lifted_off_the_organ_however_deep_it_is(cube: Organ, depth: float) -> None:
-    """Of a cube of 200 mm, whose top is accessible."""
+    """A cube of 200 mm, whose top is accessible."""
     lifted = cube.lifted(top("cube") - depth * UP, 0.03)
     np.testing.assert_allclose(lifted, top("cube") + (0.03 + max(0.0, -depth)) * UP, atol=1e-6)
 
@@ -304,7 +304,7 @@ def test_the_plane_of_a_cut_follows_its_handle(server: ViserServer, cube: Organ)
     handle._moved()
     assert parts[-1] == pytest.approx(0.5, abs=1e-6)
     handle.show(cube, up, 0.5)
-    assert handle._handle is node  # a handle that is held is not made anew
+    assert handle._handle is node  # a held handle is not made anew
     handle.show(cube, np.array([1.0, 0.0, 0.0]), 0.5)
     assert handle._handle is not node
     handle.hide()
@@ -333,7 +333,7 @@ def test_all_tools_are_drawn_with_their_names_and_forces(server: ViserServer, cu
 def test_a_browser_that_draws_late_drags_no_farther_than_the_mouse_went(
     server: ViserServer, cube: Organ
 ) -> None:
-    """It says of the tool where it drew it last: still where the drag began."""
+    """It reports the tool where it drew it last: still at the drag's begin."""
     user = Noted()
     tool = ToolView(server, 1, user.drag)
     tool.show(Tip(), PLACES[1], np.array([1.0, 0.0, 0.0, 0.0]))
