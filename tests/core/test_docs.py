@@ -13,7 +13,7 @@ import pytest
 from tests.helpers.paths import ROOT
 
 README, DOCS = ROOT / "README.md", ROOT / "msg_docs"
-PAGES = sorted(page for page in DOCS.rglob("*.md") if page.name != "index.md")  # of Sphinx
+PAGES = sorted(page for page in DOCS.rglob("*.md") if page.name != "index.md")  # Sphinx
 
 
 def prose(page: Path) -> str:

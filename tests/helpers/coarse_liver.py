@@ -21,7 +21,7 @@ from avatar_core.vademecum.model import Vademecum
 from tests.helpers.contact import prepare, step
 from tests.helpers.disk_cache import cached_on_disk
 
-RADIUS = 5e-3  # of the tips [m]
+RADIUS = 5e-3  # radius of the tips [m]
 DEEP = (6e-3, 12e-3, 18e-3)  # depths at which places have access, too [m]
 
 

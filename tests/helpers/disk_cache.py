@@ -1,6 +1,6 @@
 """Results computed from the code under test, once for all tests that ask for them.
 
-A result is found by a hash of all its inputs: the arguments, the file of the computing function,
+A result is found by a hash of its inputs: the arguments, the file of the computing function,
 the core, Python and all installed packages. One worker computes a result; the others wait for it.
 """
 

@@ -15,7 +15,7 @@ from avatar_core.errors import SurfaceError
 from avatar_core.geometry.level_set import DistanceGrid
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 
-RADIUS = 0.06  # of the ball [m]
+RADIUS = 0.06  # radius of the ball [m]
 
 
 def ball(radius: float = RADIUS, centre=(0.0, 0.0, 0.0), level: int = 4) -> SurfaceMesh:
@@ -44,8 +44,8 @@ def torus(radius: float, tube: float, n: int = 96) -> SurfaceMesh:
     return SurfaceMesh(points, np.vstack([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]))
 
 
-SIZE = np.array([0.12, 0.1, 0.12])  # of the block with a fissure [m]
-DEPTH = 0.06  # of the fissure, from the top [m]
+SIZE = np.array([0.12, 0.1, 0.12])  # size of the block with a fissure [m]
+DEPTH = 0.06  # depth of the fissure, from the top [m]
 
 
 def fissured_block(width: float) -> SurfaceMesh:

@@ -37,7 +37,7 @@ from avatar_ros.bench.scripted_tool import READY, RoundTrips
 
 PERIOD = 1e-3  # [s]
 ON_TIME = 1.5e-3  # longest period that is on time [s]
-PRIORITY = 80  # of contact node, tool and sleeping loop in the real-time mode
+PRIORITY = 80  # priority of contact node, tool and sleeping loop in the real-time mode
 _START_TIMEOUT = 120.0  # compilation included [s]
 _WARM = 0.1  # fraction of a run before the first comparison of the processes
 _LAST = 1.5  # time before the end, with the tool still running, of the second comparison [s]

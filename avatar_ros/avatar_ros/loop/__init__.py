@@ -2,7 +2,7 @@
 
 Poses come in, one compiled step runs, and wrench, state and cloud go out.
 
-A method marked *real-time safe* is meant for the loop: it takes no lock, reads no file, writes no
-log, raises nothing in ordinary use, and allocates no more than the small objects of a Python call.
+A method marked *real-time safe* is meant for the loop. It takes no lock, reads no file, writes no
+log and raises nothing in ordinary use. It allocates only the small objects of a Python call.
 All other methods belong to the node's threads.
 """

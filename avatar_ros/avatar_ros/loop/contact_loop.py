@@ -1,9 +1,9 @@
 """The loop of the contact node: a thread that waits for a pose, steps and publishes.
 
 It waits for nothing but poses. Without a model it steps every fifth period and no pose wakes it:
-there is no force that could be late, and the wrench of zero keeps its deadline. While no tool is
-connected either, it steps ten times a second, until the node wakes it. An exception ends it, with a
-last wrench of zero. The node exchanges two references with it: the data of the model in use and the
+no force could be late, and the wrench of zero keeps its deadline. While no tool is connected
+either, it steps ten times a second, until the node wakes it. An exception ends it, with a last
+wrench of zero. The node exchanges two references with it: the data of the model in use and the
 record of times.
 
 When a model replaces another, the loop steps both for ``BLEND`` seconds. It publishes their mean,

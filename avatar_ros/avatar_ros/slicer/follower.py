@@ -33,7 +33,7 @@ class Follower:
             target = np.concatenate([position, quaternion])
             start = target if self._from is None else self._at(now)
             if start[3:] @ target[3:] < 0.0:
-                target[3:] *= -1.0  # the same rotation, the shorter way
+                target[3:] *= -1.0  # equal rotation, the shorter way
             self._takes = min(now - self._begin, LONGEST)
             self._from, self._to, self._begin = start, target, now
 

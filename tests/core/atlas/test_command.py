@@ -38,7 +38,7 @@ def test_create_add_and_show(run: Command, livers: list[SurfaceMesh], tmp_path: 
     assert "skipped: empty:" in err and "Traceback" not in err
 
     twin = tmp_path / "twin.obj"
-    twin.write_text((folder / "liver0.obj").read_text() + "\n")  # the same shape in another file
+    twin.write_text((folder / "liver0.obj").read_text() + "\n")  # an equal shape in another file
     code, out, err = run("add", file, folder / "liver1.obj", twin, "--jobs", 1)
     assert code == 0 and "1 of 2 added, 1 there before, 0 skipped; 3 anatomies" in out
     assert "notice: twin has the same shape as liver0" in err

@@ -243,7 +243,7 @@ def test_help_shows_every_unit(avatar: Command) -> None:
             for unit in units:
                 described = str(parameter.help).partition(unit)[0].split()[-1]
                 assert f"{described} {unit}" in shown, (words, parameter.name)
-    assert n_metres >= 5  # of vademecum, atlas create and export
+    assert n_metres >= 5  # options of vademecum, atlas create and export
 
 
 def test_ctrl_c_is_said_and_leaves_nothing(

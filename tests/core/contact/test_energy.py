@@ -120,7 +120,7 @@ def closed_path_work(v: Vademecum, data: ContactData, n_paths: int, seed: int) -
     """Return the largest |work| / peak energy over loops that start and end 15 mm off the organ.
 
     A loop that only grazes the organ leaves it within a step or two, which the trapezoidal rule
-    does not resolve; an outlier is therefore integrated again, twenty times finer. Where the organ
+    does not resolve. An outlier is therefore integrated again, twenty times finer. Where the organ
     folds, 15 mm above one part may lie within another. Such a loop is left out: a tip that begins
     inside has no force until it has come out.
     """

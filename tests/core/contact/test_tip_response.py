@@ -47,7 +47,7 @@ def test_the_splines_take_the_compliance_of_each_sample() -> None:
     values = 2.0 + np.sin(x)[:, None, None] * np.cos(0.7 * x)[None, :, None] * np.ones(N)
     inner = values[2:-2, 2:-2, 2:-2]
     np.testing.assert_allclose(at_its_samples(_taking(values)), inner, rtol=0.01)
-    assert abs(at_its_samples(values.astype(np.float32)) - inner).max() > 0.025  # which blurs them
+    assert abs(at_its_samples(values.astype(np.float32)) - inner).max() > 0.025  # blurred
 
 
 @pytest.mark.parametrize("jump", [10.0, 1e3])

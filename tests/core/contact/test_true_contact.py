@@ -160,7 +160,7 @@ def pairs_of(sites: Sequence[Site]) -> list[tuple[Site, Site]]:
 def test_two_tips_on_the_phantom_feel_resolved_contacts(phantom_vademecum: Vademecum) -> None:
     """Two tips on the phantom bear the forces of resolved contacts.
 
-    The force on a tip that the other has almost lifted off is a small difference of two depths; its
+    The force on a tip that the other has almost lifted off is a small difference of two depths. Its
     error is compared with a tenth of the other's force.
     """
     v, surface = phantom_vademecum, phantom_liver()

@@ -36,7 +36,7 @@ Figure = Callable[[str], None]
 
 CORK = Material(YOUNG, 0.0)  # a column of it does not swell: uniaxial stretch has a closed form
 CRITICAL = 1.0 / np.sqrt(3.0)  # stretch at which d/ds (s^3 - s) = 0
-ROUNDING = 1e-9  # of a displacement that the elements hold exactly, relative to the length
+ROUNDING = 1e-9  # error of an exactly represented displacement, relative to the length
 
 MATERIALS = {"StVK": StVenantKirchhoff, "neo-Hookean": NeoHookean}
 both = pytest.mark.parametrize("kind", MATERIALS.values(), ids=list(MATERIALS))
@@ -289,7 +289,7 @@ def test_60_mm(name: str, way: str, spacing: float, bearable: float, figure: Fig
         assert depths[-1] == pytest.approx(60e-3)
     work, error = stored_and_done(depths, forces)
     assert error < 1e-3 * energy[-1]
-    # of the force, which is as accurate as the residual
+    # relative to the force, which is as accurate as the residual
     assert np.abs(work - energy)[3:].max() < error + 2e-6 * energy[-1]
     assert (np.diff(energy) > 0.0).all() and (forces[1:] > 0.0).all()
     balance = abs(work[-1] / energy[-1] - 1.0)
@@ -318,7 +318,7 @@ def test_push_release_pull_release(kind: type, figure: Figure) -> None:
         off.append(np.abs(state.displacement - fresh.displacement).max() / size)
         energy.append(problem.energy(state.displacement))
         assert least_det(problem, state.displacement) > 0.0
-    assert max(off) < 1e-6  # of the tolerance of the residual
+    assert max(off) < 1e-6  # the residual's tolerance
     for released in (1, 3):
         assert np.abs(states[released].displacement).max() < 1.1 * remainder * size
         assert energy[released] < 2.0 * remainder**2 * energy[0]

@@ -17,7 +17,7 @@ from avatar_core.geometry.cutting import cut, snapped
 from avatar_core.geometry.mesh import TetMesh
 from tests.helpers.elastic_shapes import TOP, block, box_mesh, compliance, force_on, nodes_of
 
-SIDE = 0.1  # of the box [m]
+SIDE = 0.1  # side of the box [m]
 LEFT_RIGHT = CutSurface((0.0, -1.0, 0.0), (0.05, 0.05, 0.05), (1.0, 0.0, 0.0))  # opens from above
 LEVEL = CutSurface((1.0, 0.0, 0.0), (0.05, 0.05, 0.05), (0.0, 1.0, 0.0))
 
@@ -130,14 +130,14 @@ def test_it_opens_from_the_edge_inward_one_strip_after_the_other() -> None:
     problem = cut_box(LEFT_RIGHT, 0.0)
     resection = problem.resection
     assert resection is not None
-    assert resection.fronts[0] < resection.fronts[-1] <= 0.0  # of -y: from the top down
+    assert resection.fronts[0] < resection.fronts[-1] <= 0.0  # heights along -y: from the top down
     np.testing.assert_allclose(resection.factors, TIE)
     for k in range(N_STRIPS + 1):
         factors = replace(resection, opened=k / N_STRIPS).factors
         np.testing.assert_allclose(factors, [0.0] * k + [TIE] * (N_STRIPS + 1 - k), atol=1e-3)
     middle = replace(resection, opened=0.3).factors
     assert middle[0] < middle[1] < middle[2]
-    work = []  # of a load that pulls the top apart
+    work = []  # work of a load that pulls the top apart
     for opened in np.linspace(0.0, 1.0, 11):
         here = problem.at(problem.material, opened=float(opened))
         work.append(compliance(here)[0, 0])

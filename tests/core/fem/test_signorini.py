@@ -19,7 +19,7 @@ from avatar_core.geometry.tip import Tip
 from avatar_core.offline.resolved_contact import contacts_at
 from tests.core.conftest import box_mesh, box_regions
 
-SIDE = 0.2  # of the cube in place of a half-space [m]
+SIDE = 0.2  # side of the cube in place of a half-space [m]
 TOP = np.array([0.5 * SIDE, SIDE, 0.5 * SIDE])
 UP = np.array([0.0, 1.0, 0.0])
 MATERIAL = Material()

@@ -21,7 +21,7 @@ from tests.helpers.examples import examples
 
 Figure = Callable[[str], None]
 
-SIDE = 0.1  # of the box [m]
+SIDE = 0.1  # side of the box [m]
 ELEMENTS: tuple[Element, ...] = ("P1", "P2", "Taylor-Hood")
 
 

@@ -65,7 +65,7 @@ def test_vertices_move_onto_a_plane_between_them(
     assert quality(mesh).min_dihedral > 5.0
     faces = cut(mesh, second).cut_faces[0]
     off = np.abs(surface.heights(mesh.vertices[np.unique(faces)]))
-    assert off.mean() < 0.05 * 0.1 / 6.0  # of an edge
+    assert off.mean() < 0.05 * 0.1 / 6.0  # relative to an edge
     expected = 1e-3 * (1.0 - x / 0.1)  # through the centre in y and z
     assert mesh.tet_volumes[second].sum() == pytest.approx(expected, rel=0.02)
 

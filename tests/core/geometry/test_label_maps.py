@@ -51,7 +51,7 @@ def test_label_map_honours_its_affine(tmp_path, turn, mirror, size):
     assert np.allclose(high, [0.05, 0.03, 0.09], atol=size[2] * 0.5e-3)
     assert surface.volume == pytest.approx(WHOLE, rel=0.02)
     (notice,) = surface.notices
-    assert notice in [f"read label 1, {n} ml" for n in (501, 502, 503)]  # of 502.7 ml, by voxels
+    assert notice in [f"read label 1, {n} ml" for n in (501, 502, 503)]  # 502.7 ml, by voxels
 
 
 @pytest.mark.parametrize("radius", [5.0, 10.0])
@@ -211,7 +211,7 @@ def dicom_segmentation(path: Path, tilt: float = 20.0, kind: str = "BINARY") -> 
     from pydicom.sr.codedict import codes
     from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
 
-    rows, columns, slices = 110, 80, 40  # of y, x, z
+    rows, columns, slices = 110, 80, 40  # along y, x, z
     turn = Rotation.from_euler("x", tilt, degrees=True).as_matrix()
     origin = np.array([-90.0, -60.0, -90.0])  # LPS
     study, series, frame = generate_uid(), generate_uid(), generate_uid()

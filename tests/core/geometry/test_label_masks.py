@@ -12,9 +12,9 @@ import pytest
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from tests.helpers.known_surfaces import refused
 
-SIZE = 4.0  # of voxels [mm]
+SIZE = 4.0  # size of voxels [mm]
 N = 40  # along each axis
-RADIUS = 60.0  # of the organ, about the middle of the map [mm]
+RADIUS = 60.0  # radius of the organ, about the middle of the map [mm]
 
 
 def ball(radius: float, *centre: float) -> np.ndarray:

@@ -43,7 +43,7 @@ from tests.helpers.known_surfaces import (
 
 # figures are only added to
 few = examples(5, suppress_health_check=[HealthCheck.function_scoped_fixture])
-fractions = st.tuples(*3 * [st.floats(0, 1)])  # of a cell: position of the grid
+fractions = st.tuples(*3 * [st.floats(0, 1)])  # position of the grid, in cells
 
 
 def sphere_grid(spacing: float) -> DistanceGrid:

@@ -10,7 +10,7 @@ from avatar_core.geometry.offsets import MARGIN, SPACING, OffsetGrid, exact_offs
 from avatar_core.geometry.skin import Soup
 from tests.helpers.known_surfaces import ball
 
-RADIUS = 30e-3  # of the ball [m]
+RADIUS = 30e-3  # radius of the ball [m]
 LAYER = 8e-3  # above and below its surface [m]
 
 

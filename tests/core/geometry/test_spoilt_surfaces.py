@@ -248,7 +248,7 @@ def test_a_fissure_along_the_grid_costs_half_a_cell_of_it_at_most(figure, width,
     spacing = 2.5e-3
     upright = fissured_block(width)
     grid = distance_grid(upright, spacing, 2 * spacing)
-    nearest = np.abs(grid.points[:, 0]).min()  # of the planes of grid points to the fissure
+    nearest = np.abs(grid.points[:, 0]).min()  # distance of the grid's planes from the fissure
     across = np.array([nearest + shift * spacing, 0, 0])
     moved = SurfaceMesh(upright.vertices + across, upright.faces)
     grid = type(grid)(

@@ -26,7 +26,7 @@ from tests.helpers.contact import prepare, step
 from tests.helpers.disk_cache import cached_on_disk
 from tests.helpers.tool_motion import press
 
-CONTRAST, SIZE, GAP = 5.0, 10e-3, 2e-3  # of a ball under the middle of a cube's top
+CONTRAST, SIZE, GAP = 5.0, 10e-3, 2e-3  # a ball under the middle of a cube's top
 RADIUS, REACH = 3e-3, 24e-3
 ORIGIN, Z = np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]])
 

@@ -33,7 +33,7 @@ def test_ends_are_nodes_and_nothing_beyond_is_answered(figure: Figure) -> None:
     )
     @example(("poisson", 0.0, 0.4999), 0.5, 2)
     @example(("contrast", 0.01, 100.0), 0.5, 3)
-    @example(("contrast", nextafter(50.0, 0.0), 50.0), 0.5, 2)  # of one logarithm
+    @example(("contrast", nextafter(50.0, 0.0), 50.0), 0.5, 2)  # ends with one logarithm
     def check(ends: tuple[str, float, float], between: float, n_nodes: int) -> None:
         name, (low, high) = ends[0], sorted(ends[1:])
         try:

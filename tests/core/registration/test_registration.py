@@ -170,7 +170,7 @@ def test_axes_are_suspected_only_if_a_rigid_motion_fits_them_better(
     mesh = phantom_vademecum.mesh
     turned = Cloud(case.cloud.points * [-1.0, -1.0, 1.0])
     for fits, is_suspected in ((0.001, True), (0.02, False)):
-        off = {True: 0.02, False: fits}  # of the organ moved rigidly: as given, and reversed
+        off = {True: 0.02, False: fits}  # distances after a rigid motion: as given, and reversed
 
         def moved_off(cloud: Cloud, off: dict[bool, float] = off) -> float:
             return off[bool(np.allclose(cloud.points, turned.points))]

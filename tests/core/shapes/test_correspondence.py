@@ -120,7 +120,7 @@ def test_gradient_of_the_distortion_is_its_slope(bent):
     distortion, x = bent
     gradient, _ = distortion.derivatives(x)
     direction = np.random.default_rng(1).standard_normal(x.shape)
-    step = 1e-6 * 0.1  # of the box: central differences are then exact to 1e-8
+    step = 1e-6 * 0.1  # relative to the box: central differences are then exact to 1e-8
     slope = distortion.energy(x + step * direction) - distortion.energy(x - step * direction)
     assert gradient @ direction.ravel() == pytest.approx(slope / (2 * step), rel=1e-6)
 

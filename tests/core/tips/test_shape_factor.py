@@ -24,7 +24,7 @@ from tests.helpers.half_space import sneddon
 from tests.helpers.known_surfaces import ball
 
 PATCH = 12e-3
-SLOPE = np.tan(np.radians(15.0))  # of both sides of the roof
+SLOPE = np.tan(np.radians(15.0))  # slope of both sides of the roof
 TOP = 0.06  # height of the roof's ridge [m]
 BALL = 40e-3  # radius of the round organ [m]
 RADII = (1.5e-3, 5e-3, 7e-3, 10e-3)

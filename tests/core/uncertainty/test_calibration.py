@@ -107,7 +107,7 @@ def test_the_way_back_and_what_is_not_known_are_left_out(
     size = np.linalg.norm(forces, axis=1)
     spoilt, doubled = tips.copy(), size.copy()
     spoilt[2] = np.nan
-    first = slice(5, 125)  # of the first push
+    first = slice(5, 125)  # rows of the first push
     peak = 5 + int(np.argmax(size[first]))
     doubled[peak + 1 : 125] *= 0.5
     before, after = palpation_of(tips, size), palpation_of(spoilt, doubled)

@@ -237,7 +237,7 @@ def test_depths_between_those_prepared_are_interpolated_and_others_held(
     for depth in (0.1e-3, 1e-3, 2e-3, 6e-3, 13e-3):
         size = press(data, SPHERE, v.surface.centers[j], v.surface.normals[j], depth)
         band.update()
-        own = float(-data.state.gap[0])  # of the smooth surface
+        own = float(-data.state.gap[0])  # depth below the smooth surface
         place = np.clip(np.log(own / DEPTHS[0]) / np.log(3.0), 0.0, len(DEPTHS) - 1.0)
         np.testing.assert_allclose(
             np.linalg.norm(band.edges[:, 0, :3], axis=1), size * np.exp([0.0, place]), rtol=1e-5

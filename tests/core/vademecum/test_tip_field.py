@@ -19,7 +19,7 @@ from tests.core.conftest import box_mesh, box_regions
 from tests.helpers.known_surfaces import ball
 
 PATCH = 12e-3
-RADIUS = 40e-3  # of the ball
+RADIUS = 40e-3  # radius of the ball
 TIP = 3e-3  # radius of a ball that follows the surface away from its edges
 OVERLAP = 1e-4  # largest overlap of such a ball
 OFFSETS = np.array([0.0, 1.5e-3, 3e-3, 10e-3, 20e-3])

@@ -28,7 +28,7 @@ from tests.ros.helpers.stepped_loop import NOW, pose
 
 STAMP = NOW + 123_456_789  # [ns]
 PLACE = np.array([1.0, -2.0, 3.0])
-FRAMES = ("o", "organ", "patient/organ_1")  # of lengths that pad differently
+FRAMES = ("o", "organ", "patient/organ_1")  # lengths that pad differently
 
 
 @pytest.mark.parametrize("frame", FRAMES)

@@ -20,7 +20,7 @@ from avatar_ros.ui.view.orientation import FOV, Pose, basis, standard_view, view
 from tests.helpers.slowness import Deadline, end_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-TOKEN = "a-token-for-tests"  # of the page
+TOKEN = "a-token-for-tests"  # token of the page
 WINDOW = (1280, 800)  # [px]
 SLOW = 300_000  # time limit for starts, compilation or builds on a busy machine [ms]
 # software rendering: there is no graphics card here

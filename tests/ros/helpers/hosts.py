@@ -26,7 +26,7 @@ class Hosts:
         Folder that is empty on ``haptic``.
     """
 
-    ADDRESS = "10.77.0.1"  # of planning
+    ADDRESS = "10.77.0.1"  # address of planning
 
     def __init__(self, folder: Path, environment: dict[str, str], hidden: Path | None) -> None:
         mark = f"{os.getpid() % 100000}"

@@ -17,8 +17,8 @@ from avatar_core.scene.recording import Clouds, Periods, Recording
 from avatar_ros.msg import ContactState
 
 OK, OUT = ContactState.STATUS_OK, ContactState.STATUS_OUT_OF_RANGE
-NAMES = ("left", "right")  # of two tools
-PLACES = np.array([[0.0, 0.1, 0.0], [0.05, 0.1, 0.0]])  # of their tips [m]
+NAMES = ("left", "right")  # names of two tools
+PLACES = np.array([[0.0, 0.1, 0.0], [0.05, 0.1, 0.0]])  # places of the two tools' tips [m]
 TIP = PLACES[0]
 UP = np.array([0.0, 0.0, 1.0])
 

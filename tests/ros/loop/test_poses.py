@@ -1,6 +1,6 @@
 """Faulty poses, through the parser and the loop, without any other process.
 
-The loop is stepped by hand on a clock that the test sets; tools read serialised poses from a queue
+The loop is stepped by hand on a clock that the test sets. Tools read serialised poses from a queue
 of depth one, as the subscription's.
 """
 
@@ -111,7 +111,7 @@ def test_a_slow_stream_is_called_so_before_its_second_pose(
 ) -> None:
     """A first pose is answered; a late second one is a slow rate, not an end."""
     cell = bench(timeout=0.02)
-    cell.step(None, after=60.0)  # that nobody was there
+    cell.step(None, after=60.0)  # as if nobody was there
     counter = FaultCounter(cell.tools)
     period, said = 1000 // hertz, set()
     for k in range(3000):

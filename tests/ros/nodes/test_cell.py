@@ -235,7 +235,7 @@ def test_a_pose_that_stops_coming_is_stale(
     gone = lambda wrench: not force_of(wrench).any()  # noqa: E731
     wrench = probe.next(WrenchStamped, "tool/servo_cf", qos.COMMAND, gone, 5.0)
     assert not stale.contacts
-    assert stamp_of(wrench) in hand.stamps  # of the last pose, not of some clock
+    assert stamp_of(wrench) in hand.stamps  # the last pose's stamp, not a clock's time
 
 
 def processor_time(pid: int) -> float:
@@ -245,7 +245,7 @@ def processor_time(pid: int) -> float:
 
 
 def test_the_loop_keeps_its_rate_without_poses(cell: Any, probe: Any) -> None:
-    windows: list[LoopStatistics] = []  # of 1 s
+    windows: list[LoopStatistics] = []  # windows of 1 s
     listener = probe.node.create_subscription(
         LoopStatistics, "statistics", windows.append, qos.STATISTICS
     )
@@ -259,7 +259,7 @@ def test_the_loop_keeps_its_rate_without_poses(cell: Any, probe: Any) -> None:
         used = processor_time(cell["contact"].pid) - used
         work = used / ((time.monotonic() - began) * windows[-1].rate)
         windows.clear()
-        slept = bare_loop.periods(1.2, work)  # of a loop with as much work, meanwhile
+        slept = bare_loop.periods(1.2, work)  # a loop with as much work, meanwhile
         # The design rate is 1000 Hz; the bound only tells a working loop from a broken one, since
         # these tests share their cores with whatever else runs: of the time that the machine left
         # to the bare loop. `avatar bench cell` measures it.

@@ -27,7 +27,7 @@ from tests.ros.helpers.stepped_loop import pose
 pytestmark = pytest.mark.long  # it builds organs and starts nodes
 
 DEVICES = PARAMS / "devices"
-CRTK = QoSProfile(depth=10)  # of crtk_python_client: reliable, the last ten
+CRTK = QoSProfile(depth=10)  # profile of crtk_python_client: reliable, the last ten
 # published by cisst-ros when it changes
 LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 

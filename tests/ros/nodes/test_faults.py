@@ -35,7 +35,7 @@ rclpy.init()
 node = rclpy.create_node("passer_by")
 time.sleep(0.4)
 """
-STALE = 20e-3  # of a pose [s]
+STALE = 20e-3  # age of a stale pose [s]
 SILENT_AFTER = STALE + 10e-3  # the force is gone [s]
 
 

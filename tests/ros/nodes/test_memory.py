@@ -20,7 +20,7 @@ from tests.helpers.processes import has_ended
 from tests.helpers.slowness import Deadline, wait_until
 from tests.ros.conftest import START_TIMEOUT
 
-MOST = 60.0  # of a loader without its announcement [MB]
+MOST = 60.0  # memory of a loader without its announcement [MB]
 # modules that only reading and preparing a vademecum needs
 LIBRARIES = {"scipy.sparse", "scipy.spatial", "scipy.linalg", "skfem", "igl", "rslab", "h5py"}
 

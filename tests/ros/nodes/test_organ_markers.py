@@ -84,7 +84,7 @@ def test_it_comes_at_display_rate(
         probe.until(lambda: len(came) > 30, 10.0)
     came.clear()
     probe.spin(3.0)
-    assert len(came) <= 95  # of 1,000 clouds a second
+    assert len(came) <= 95  # out of 1,000 clouds a second
 
 
 def test_a_scale_ends_on_a_round_number_and_never_shrinks() -> None:

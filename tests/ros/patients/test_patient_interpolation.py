@@ -217,7 +217,7 @@ def test_an_interpolated_patient_is_there_first(node: Module, probe: Any, folder
     assert (status, built.file) == (GoalStatus.STATUS_SUCCEEDED, "first.h5"), built.message
     better = load_vademecum(folder / "first.h5")
     assert better.certificate.l2_mean < first.certificate.l2_mean
-    assert len(first.mesh.vertices) != len(better.mesh.vertices)  # that of the template
+    assert len(first.mesh.vertices) != len(better.mesh.vertices)  # the template's mesh
     registered = [told.stage for told in pursuit.told if told.file].count("registration")
     assert registered <= 1  # begun, but known: the template is registered once
     held = {"interpolated_first": True, "supports": ["bare_area"], "fidelity": "reduced"}

@@ -87,7 +87,7 @@ def test_another_organ_uses_what_its_supports_allow(
     found, notices = usable_material(organ, material)
     assert found == used
     assert (not notices) if reason == "" else reason in notices[0]
-    scene_spec(organ, parse_scene("name: bare", "scene"), found)  # which does not refuse it
+    scene_spec(organ, parse_scene("name: bare", "scene"), found)  # it is not refused
 
 
 def test_a_fixed_support_keeps_the_modulus_as_built(organ: Vademecum) -> None:

@@ -20,7 +20,7 @@ from avatar_core.scene.file import read_scene, shipped_scene
 from tests.ros.helpers.page import NAMES, PLACES, UP, Noted
 
 RANGES = {"young": (1e3, 1e6, 170e3), "poisson": (0.40, 0.49, 0.48)}  # least, most, as built
-OWN_TIPS = {  # of a contact node that was started without a scene
+OWN_TIPS = {  # parameters of a contact node that was started without a scene
     "scene": "",
     "tip.shape": ["sphere", "flat"],
     "tip.radius": [4e-3, 2e-3],
@@ -83,7 +83,7 @@ def test_a_return_is_taken_back_as_a_whole(chosen: Chosen, cell: Noted) -> None:
     assert cell.of("set_material")[-1] == {"young": 170e3}
     chosen.undo()
     assert cell.of("say")[-1] == "nothing to undo"
-    chosen.return_to("", {}, chosen.look, PLACES[:1] + 0.1)  # of a cell of one tool
+    chosen.return_to("", {}, chosen.look, PLACES[:1] + 0.1)  # state kept in a cell with one tool
     np.testing.assert_allclose(chosen.tools.targets, [PLACES[0] + 0.1, PLACES[1]])
 
 

@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 
 from tests.ros.helpers.browser import TOKEN, free_port
 
-ELSEWHERE = "http://127.0.0.1:1"  # the same site for cookies, another origin
+ELSEWHERE = "http://127.0.0.1:1"  # same site for cookies, another origin
 
 
 @pytest.fixture(scope="module")

@@ -34,8 +34,8 @@ pytestmark = [pytest.mark.long, pytest.mark.timing]
 DEEP = -0.002  # height of the tip's centre over the surface, while it presses [m]
 ENOUGH = 3.0  # force that remains while the tool swings [N]
 SWING = 10.0  # way of the mouse [px]
-SECONDS = 6.0  # of a measurement
-PRIORITY = 80  # of the loop: without one, all processes share the cores
+SECONDS = 6.0  # duration of a measurement
+PRIORITY = 80  # the loop's; without a priority, all processes share the cores
 
 
 @pytest.fixture(scope="module")

@@ -95,7 +95,7 @@ def test_a_dot_of_a_plane_is_dragged_over_the_organ(cube: Organ) -> None:
         place = hit(corner + 0.3 * UP, -UP, *surface)
         assert place is not None
         measures.click(place, cube.vertices)
-    first = 3  # of the plane's dots
+    first = 3  # first of the plane's dots
 
     def placed() -> np.ndarray:
         return np.array([place.at(cube.vertices) for place in measures._places[PLANE]])

@@ -95,7 +95,7 @@ def test_the_letters_of_a_narrow_picture_are_not_cut(side: str, aspect: float) -
     """A long organ; if a tool takes its place, a letter may be missing."""
     vertices = 1e-3 * ball(500, 50.0)[0] * [2.0, 1.6, 1.4]
     pose = standard_view(side, np.zeros(3), 0.2, aspect)
-    half = 0.025  # of a letter
+    half = 0.025  # half the size of a letter
     tools = label_places(vertices)
     for tips in (NO_TIPS, *(place[None] for place in tools.values())):
         found = seen_from(pose, vertices, tips, aspect)

@@ -228,7 +228,7 @@ def test_labels_of_a_file_reach_the_build(tab: PatientTab, user: Noted) -> None:
     tab._ask()
     assert user.of("build") == [] and "choose a surface" in tab._stage.content
     tab._surfaces.value = "case.nii.gz"
-    tab._unit.value, tab._axes.value = "cm", "LPS"  # of another file
+    tab._unit.value, tab._axes.value = "cm", "LPS"  # from another file
     tab.offer_labels(("left lobe", "right lobe", "lesion", "vein"))
     assert not (tab._unit.visible or tab._axes.visible)  # a label map states both
     assert tab._wanted().unit == tab._wanted().axes == ""

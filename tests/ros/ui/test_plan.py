@@ -41,7 +41,7 @@ KEPT = Bookmark(
 def test_states_are_kept_by_organ_and_come_back(tmp_path: Path) -> None:
     Bookmarks(tmp_path, "a" * 64, "liver").keep(KEPT)
     assert Bookmarks(tmp_path, "a" * 64, "liver").kept == [KEPT]
-    assert Bookmarks(tmp_path, "b" * 64, "liver").kept == []  # of another organ
+    assert Bookmarks(tmp_path, "b" * 64, "liver").kept == []  # another organ has no states
     again = Bookmarks(tmp_path, "a" * 64, "liver")
     again.drop(KEPT.label)
     assert Bookmarks(tmp_path, "a" * 64, "liver").kept == []

@@ -95,7 +95,7 @@ def test_a_recording_says_what_it_lacks(cube: Organ) -> None:
     assert recorded_text(recording(cube, of, Scene())) == (
         "recorded 1.0 s, 490 of 1,000 periods (500 came late in the loop, 10 lost)"
     )
-    often = replace(of, stamp=of.stamp // 5, number=np.arange(n))  # of several tools
+    often = replace(of, stamp=of.stamp // 5, number=np.arange(n))  # as with several tools
     expected = "recorded 0.2 s, 490 of 490 periods"
     assert recorded_text(recording(cube, often, Scene())) == expected
 

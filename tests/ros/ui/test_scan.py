@@ -27,7 +27,7 @@ from tests.helpers.box_organ import organ
 from tests.helpers.small_files import ball
 from tests.ros.helpers.page import AtOnce, Noted, image
 
-ORIGIN = np.array([-40.0, 12.0, 70.0])  # of the first slice of a series, LPS [mm]
+ORIGIN = np.array([-40.0, 12.0, 70.0])  # origin of a series' first slice, LPS [mm]
 
 
 @pytest.fixture

@@ -100,7 +100,7 @@ def test_a_force_is_that_of_the_clouds_period(state: SharedToolState) -> None:
         send(state, rows((OK, 0.001 * n), (OK, 0.0), stamp=1000 + n))
     found = state.period(1000 + 3 * N_RECENT - 100)
     assert found is not None and found["force"][0, 1] == 0.001 * (3 * N_RECENT - 100)
-    newest = state.period(77)  # of a cloud whose state has not come: the newest
+    newest = state.period(77)  # the cloud's state has not come: the newest
     assert newest is not None and (newest["stamp"] == 1000 + 3 * N_RECENT - 1).all()
 
 
@@ -195,7 +195,7 @@ def test_what_is_extrapolated_on_another_tool_is_not_missed(chooser: PeriodChoos
     shown = drawn(chooser, rows((OK, 1.0), (ContactState.STATUS_EXTRAPOLATED, 25.0)))
     expected = "Extrapolated: beyond the computed range; do not rely on the force"
     assert alerts(EXACT, (), shown, NAMES) == [f"right: {expected}"]
-    assert alerts(EXACT, (), [shown[1], shown[1]], NAMES) == [expected]  # of both tools: shown once
+    assert alerts(EXACT, (), [shown[1], shown[1]], NAMES) == [expected]  # both tools: shown once
 
 
 def test_a_patient_of_large_expected_error_is_marked() -> None:
@@ -211,7 +211,7 @@ def test_a_stiffness_that_nobody_chose_is_called_assumed() -> None:
     default = replace(EXACT, young_modulus=170e3)
     (alert,) = alerts_of_organ(default, ("poisson",))
     assert "Young's modulus is assumed: 170 kPa" in alert
-    assert alerts_of_organ(default, ("young",)) == []  # of a scene, a calibration or a user
+    assert alerts_of_organ(default, ("young",)) == []  # given by a scene, a calibration or a user
     assert alerts_of_organ(replace(EXACT, young_modulus=8e3), ()) == []  # it was given for the file
 
 
@@ -267,9 +267,9 @@ def test_the_page_shows_a_band_in_proportion_to_the_force_beside_it() -> None:
     ratios = BandRatios(lambda: now[0])
     assert ratios.of(2.0) is None
     ratios.note(0, 0.6, 1.0)
-    assert ratios.of(2.0) is None  # of one edge alone
+    assert ratios.of(2.0) is None  # one edge alone is known
     ratios.note(1, 3.4, 2.0)
-    ratios.note(1, 9.9, float("nan"))  # of a period that is not known
+    ratios.note(1, 9.9, float("nan"))  # the force of the period is not known
     ratios.note(1, 0.0, 0.0)
     assert ratios.of(2.0) == pytest.approx((1.2, 3.4))
     assert ratios.of(0.0) is None

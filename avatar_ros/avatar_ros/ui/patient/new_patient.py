@@ -219,7 +219,7 @@ class NewPatient:
         preview, (name, radius) = self._preview, self._brush
         if preview is None:
             return
-        # of this preview: numbers depend on the request
+        # looked up in this preview: numbers depend on the request
         region = (BRUSHES | preview.named).get(name)
         if region is None:
             return

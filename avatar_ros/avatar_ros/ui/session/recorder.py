@@ -18,7 +18,7 @@ from avatar_core.vademecum.accuracy import Cloud
 from avatar_core.vademecum.model import Vademecum
 from avatar_ros.ui.tools.tool_state import N_ROWS, SharedToolState
 
-_MOST_BYTES = 1 << 30  # of all surfaces of a recording
+_MOST_BYTES = 1 << 30  # largest size of all surfaces in a recording
 
 
 def scene_in_force(
@@ -155,7 +155,7 @@ def _periods(rows: np.ndarray) -> Periods:
         number=rows["number"][:, 0].copy(),
         stamp=rows["stamp"][:, 0].copy(),
         tip=rows["tip"].copy(),
-        orientation=np.tile([0.0, 0.0, 0.0, 1.0], (*rows["tip"].shape[:2], 1)),  # of the page
+        orientation=np.tile([0.0, 0.0, 0.0, 1.0], (*rows["tip"].shape[:2], 1)),  # upright
         status=rows["status"].astype(np.uint8),
         force=rows["force"].copy(),
         error=rows["error"].copy(),

@@ -104,7 +104,7 @@ class ToolTab:
         set_options(self._tools, list(names))
         if chosen != self._chosen:  # the list may show a newer choice, still on its way
             self._chosen = self._tools.value = chosen
-            self.forget_force()  # of another tool
+            self.forget_force()  # the curve is another tool's
         if self._tools.visible != (len(names) > 1):
             self._tools.visible = len(names) > 1
 

@@ -47,15 +47,15 @@ EACH = np.dtype(
 ROW = np.dtype(
     [
         ("number", np.int64),
-        ("stamp", np.int64),  # of the tool's pose [ns]
+        ("stamp", np.int64),  # stamp of the tool's pose [ns]
         ("tip", np.float64, 3),
         ("force", np.float64, 3),
         ("error", np.float64),
         ("sent_fraction", np.float64),
-        ("status", np.int64),  # of avatar_ros/msg/ContactState
+        ("status", np.int64),  # status of avatar_ros/msg/ContactState
         ("touches", np.int64),
         ("held", np.int64),  # whether its jaw holds tissue
-        # of the vademecum that the contact node used, by :func:`organ_number`
+        # number of the vademecum that the contact node used, by :func:`organ_number`
         ("organ", np.uint64),
     ],
     align=True,

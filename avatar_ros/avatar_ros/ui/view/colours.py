@@ -21,7 +21,7 @@ CLAMP = ((70, 70, 70), (165, 165, 165))  # checks where the organ is clamped
 SPRINGS = (70, 70, 70)  # hatching where springs hold the organ
 ACCESS = (38, 84, 124)  # stripes where tools reach
 MISSED = (240, 228, 66)  # parts of an organ that a template does not reach
-HELD = (170, 170, 170)  # of a shape that is not the present one
+HELD = (170, 170, 170)  # grey for a shape that is not the present one
 _DARKEST, _LIGHTEST = 0.42, 1.15  # factors of the colour of tissue
 _LIGHT = np.array([0.35, 0.75, 0.55])  # direction to the lamp: from the front, above, a bit right
 

@@ -50,7 +50,7 @@ def unlit_glb(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> b
     }
     text = json.dumps(whole).encode()
     text += b" " * (-len(text) % 4)
-    binary = b"".join(part.tobytes() for part in parts)  # of four bytes each, so aligned
+    binary = b"".join(part.tobytes() for part in parts)  # items of four bytes, so aligned
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks

@@ -1,7 +1,7 @@
 """Directions of the patient in the picture: right, left, front, back, head and feet.
 
 The organ's frame has the axes RAS: +x points to the patient's right, +y to the front (anterior),
-+z to the head (superior), whatever the axes of the original file.
++z to the head (superior). The axes of the original file do not matter.
 """
 
 from __future__ import annotations

@@ -145,7 +145,7 @@ def section(points: np.ndarray, height: np.ndarray, faces: np.ndarray) -> np.nda
     low, high = height[begin], height[end]
     part = low / np.where(low != high, low - high, 1.0)
     places = points[begin] + part[..., None] * (points[end] - points[begin])
-    two = (low < 0.0) != (high < 0.0)  # of the three sides
+    two = (low < 0.0) != (high < 0.0)  # whether each of the three sides is cut
     return np.asarray(places[two].reshape(-1, 2, 3), np.float32)
 
 

@@ -9,7 +9,7 @@ from avatar_core.geometry.tip import Tip
 _N_RINGS = 24
 _N_SIDES = 32
 _SHAFT = 2.0  # length of the shaft over the tip, in radii
-_LENGTH, _WIDTH = 0.09, 0.5  # of the whole shaft: length [m], radius in radii of the tip
+_LENGTH, _WIDTH = 0.09, 0.5  # whole shaft: length [m], radius in radii of the tip
 
 
 def tip_body(tip: Tip) -> tuple[np.ndarray, np.ndarray]:
