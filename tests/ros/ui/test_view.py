@@ -213,8 +213,8 @@ def test_what_springs_hold_is_hatched(view: OrganView) -> None:
 
 
 def test_the_legend_says_where_colours_of_glass_hold() -> None:
-    assert "plain background alone" in legend(DISPLACEMENT, 1.0, opacity=0.45)
-    assert "background alone" not in legend(DISPLACEMENT, 1.0)
+    assert "only on the plain background" in legend(DISPLACEMENT, 1.0, opacity=0.45)
+    assert "plain background" not in legend(DISPLACEMENT, 1.0)
 
 
 def test_little_error_looks_unlike_no_access(view: OrganView, cube: Organ) -> None:

@@ -16,7 +16,7 @@ from avatar_ros.ui.view.colours import (
 DISPLACEMENT = "displacement [mm]"
 EXPECTED_ERROR = "error of the force [%]"
 SPREAD = "spread of the force [%]"
-_OF_GLASS = "Glass: colours hold before the plain background alone"
+_OF_GLASS = "Glass: colours are exact only on the plain background"
 _KEY = "display:inline-block;width:15px;height:11px;vertical-align:-1px;margin:0 2px 0 7px"
 
 
