@@ -1,4 +1,4 @@
-"""The README and the pages of msg_docs: valid links, headings in order, HTML."""
+"""The README and the pages of msg_docs: links, headings, length, HTML."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from tests.helpers.paths import ROOT
 
 README, DOCS = ROOT / "README.md", ROOT / "msg_docs"
 PAGES = sorted(page for page in DOCS.rglob("*.md") if page.name != "index.md")  # Sphinx
+
+README_LINES, WORDS = 110, 15_000  # of all pages together, code and tables included
+LONGEST = 35  # words of a sentence
 
 
 def prose(page: Path) -> str:
@@ -73,3 +76,26 @@ def test_the_pages_become_html_without_a_warning(tmp_path: Path) -> None:
     for page in PAGES:
         html = page.relative_to(DOCS).with_suffix(".html").as_posix()
         assert (tmp_path / html).exists() and f'href="{html}"' in first, html
+
+
+def sentences(page: Path) -> list[str]:
+    """Return the sentences of paragraphs and lists, not of tables, headings and pictures."""
+    text = re.sub(r"<!--.*?-->", "", prose(page), flags=re.DOTALL)
+    text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
+    text = re.sub(r"`[^`]*`", "code", text)
+    blocks = re.split(r"\n\s*\n|\n\s*(?:[-*>]|\d+\.) ", text)
+    kept = (block for block in blocks if "|" not in block and not block.lstrip().startswith("#"))
+    return [part for block in kept for part in re.split(r"[.:!?]\s", " ".join(block.split()))]
+
+
+@pytest.mark.parametrize("page", [README, *PAGES], ids=lambda page: page.name)
+def test_sentences_are_short(page: Path) -> None:
+    assert not [sentence for sentence in sentences(page) if len(sentence.split()) > LONGEST]
+
+
+def test_the_readme_can_be_read_in_one_go() -> None:
+    assert len(README.read_text().splitlines()) <= README_LINES
+
+
+def test_the_pages_can_be_read_in_an_hour() -> None:
+    assert sum(len(page.read_text().split()) for page in PAGES) <= WORDS

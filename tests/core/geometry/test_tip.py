@@ -38,8 +38,6 @@ def test_the_slope_is_that_of_the_depth(tip: Tip) -> None:
 
 def test_the_page_has_every_shape_with_what_it_needs() -> None:
     page = (ROOT / "msg_docs" / "interfaces" / "parameters.md").read_text()
-    rows = re.findall(
-        r"^\| `(\w+)` \| ((?:`\w+`(?:, )?)+) \|", page.split("## Tips")[1], re.MULTILINE
-    )
+    rows = re.findall(r"^`(\w+)` \| ((?:`\w+`(?:, )?)+) \|", page.split("## Tips")[1], re.MULTILINE)
     found = {shape: re.findall(r"`(\w+)`", needs) for shape, needs in rows}
     assert found == {tip.shape: ["radius", *used_by(tip.shape)] for tip in one_of_each()}

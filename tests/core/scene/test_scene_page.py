@@ -21,7 +21,7 @@ WORDS = {"the vademecum's", "none", "all"}  # words for a default that is None
 
 def rows() -> dict[str, tuple[str, str]]:
     """Return default and range with unit by key."""
-    row = re.compile(r"^\| `(\S+)` \| (.*?) ?(?:\((\S+ to [^)]*)\) )?\|", re.MULTILINE)
+    row = re.compile(r"^`(\S+)` \| (.*?) ?(?:\((\S+ to [^)]*)\) )?\|", re.MULTILINE)
     return {key: (default, span) for key, default, span in row.findall(PAGE)}
 
 

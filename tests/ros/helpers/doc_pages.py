@@ -25,8 +25,8 @@ def index() -> list[dict[str, str]]:
     A heading names the node.
     """
     row = re.compile(
-        r"^\| \[`(?P<interface>[^`]+)`\]\((?P<page>[^)]+)\)"
-        r" \| `(?P<type>\w+/(?P<kind>\w+)/\w+)` \| (?P<direction>\w+) \|$",
+        r"^\[`(?P<interface>[^`]+)`\]\((?P<page>[^)]+)\)"
+        r" \| `(?P<type>\w+/(?P<kind>\w+)/\w+)` \| (?P<direction>\w+)$",
         re.MULTILINE,
     )
     sections = (PAGES / "README.md").read_text().split("\n## ")[1:]
@@ -75,7 +75,7 @@ def parameter_rows(node: str) -> dict[str, str]:
     page = (PAGES / "parameters.md").read_text()
     section = page.split(f"## {node}\n")[1].split("\n## ")[0]
     rows = {}
-    for parameter, rest in re.findall(r"^\| `([^`]+)` (\|.*)$", section, re.MULTILINE):
+    for parameter, rest in re.findall(r"^`([^`]+)` (\|.*)$", section, re.MULTILINE):
         names = re.findall(r"`(\w+)`", rest) if re.search("NAME|LEVEL", parameter) else [""]
         rows |= {re.sub("NAME|LEVEL", name, parameter): rest for name in names}
     return rows
