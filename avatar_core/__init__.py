@@ -39,6 +39,7 @@ _ORIGIN = {
     "LargeRule": "offline.large_deformation",
     "Material": "fem.elasticity",
     "OrganOptions": "pipeline",
+    "OrganProblem": "pipeline",
     "Patient": "atlas.patient",
     "PatientOptions": "atlas.patient",
     "Registered": "registration.register",
@@ -58,6 +59,8 @@ _ORIGIN = {
     "extend_atlas": "atlas.growth",
     "load": "vademecum.storage:load_vademecum",
     "load_atlas": "atlas.storage",
+    "mor": "reduction:",
+    "organ_problem": "pipeline",
     "patient": "atlas.patient:patient_vademecum",
     "phantom_liver": "geometry.phantom",
     "prepare": "scene.prepare",
@@ -66,6 +69,7 @@ _ORIGIN = {
     "read_surface": "geometry.surface",
     "register": "registration.register",
     "save": "vademecum.storage:save_vademecum",
+    "shapes": "shapes:",
     "step": "contact.model",
     "uncertainty": "uncertainty:",
 }
@@ -73,6 +77,8 @@ _ORIGIN = {
 __all__ = [*_ORIGIN]
 
 if TYPE_CHECKING:
+    from avatar_core import reduction as mor  # noqa: F401
+    from avatar_core import shapes as shapes
     from avatar_core import uncertainty as uncertainty
     from avatar_core.atlas.growth import create_atlas as create_atlas
     from avatar_core.atlas.growth import extend_atlas as extend_atlas
@@ -97,7 +103,9 @@ if TYPE_CHECKING:
     from avatar_core.offline.rule import BuildRule as BuildRule
     from avatar_core.offline.supports import SupportOption as SupportOption
     from avatar_core.pipeline import OrganOptions as OrganOptions
+    from avatar_core.pipeline import OrganProblem as OrganProblem
     from avatar_core.pipeline import build as build
+    from avatar_core.pipeline import organ_problem as organ_problem
     from avatar_core.reduction.coordinates import Coordinate as Coordinate
     from avatar_core.registration.cloud import Cloud as Cloud
     from avatar_core.registration.cloud import read_cloud as read_cloud

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+import scipy.sparse as sp
 
 from avatar_core.certify.combinations import COMBINATIONS, DEPTH_FRACTIONS, push_errors
 from avatar_core.certify.contact_sites import with_contact_sites
@@ -16,7 +18,7 @@ from avatar_core.common.processes import cpu_seconds, repeatable
 from avatar_core.contact.timing import timed
 from avatar_core.errors import AvatarError, ContactError, CoordinateError, MaterialError, MeshError
 from avatar_core.fem.elasticity import POISSON_RATIO_P2, Elasticity, Element, Inclusion, Material
-from avatar_core.fem.patch_loads import load_surface
+from avatar_core.fem.patch_loads import LoadSurface, load_surface, patch_loads
 from avatar_core.fem.resection import Resection, require_parts_held
 from avatar_core.fem.supports import Support
 from avatar_core.geometry.cut_surface import CutSurface
@@ -177,10 +179,10 @@ def build(
     options = options or OrganOptions()
     provenance = _provenance(surface, options)
     progress("mesh", 0.0, NO_ERROR)
-    elasticity, regions = _problem(surface, options)
+    problem = organ_problem(surface, options)
+    elasticity, regions, loads = problem.elasticity, problem.regions, problem.surface
     mesh = elasticity.mesh
     progress("mesh", 1.0, NO_ERROR)
-    loads = load_surface(mesh, regions, options.patch_radius)
     common = (surface.name, elasticity, regions, loads)
     inside = () if options.tumour is None else (options.tumour,)
     display = organ_display(mesh, surface, options.n_displayed, inside)
@@ -258,6 +260,56 @@ def _with_large(vademecum: Vademecum, options: OrganOptions, progress: Progress)
         ),
     )
     return vademecum.with_large_certificate(with_combinations(certificate, rows))
+
+
+@dataclass(frozen=True, eq=False)
+class OrganProblem:
+    """The finite-element problem of an organ, K u(s) = f(s) for all loads s, before any solution.
+
+    Attributes
+    ----------
+    elasticity : Elasticity
+        K: it solves and applies.
+    regions : Regions
+        Clamped and accessible faces over ``elasticity.mesh.boundary_faces``.
+    surface : LoadSurface
+        Load positions, normals and patch radius.
+    """
+
+    elasticity: Elasticity
+    regions: Regions
+    surface: LoadSurface
+
+    @cached_property
+    def loads(self) -> sp.csc_matrix:
+        """F: unit loads in x, y and z on each patch, (3 n_nodes, 3 n_positions) [N]."""
+        at = self.surface
+        return patch_loads(self.elasticity, at.centers, at.patch_radius).tocsc()
+
+
+@repeatable
+def organ_problem(surface: SurfaceMesh, options: OrganOptions | None = None) -> OrganProblem:
+    """Mesh an organ, hold it and discretize it, as :func:`build` does before it solves.
+
+    Parameters
+    ----------
+    surface : SurfaceMesh
+    options : OrganOptions, optional
+        Mesh, material, element, supports and patch radius count here.
+
+    Returns
+    -------
+    OrganProblem
+
+    Raises
+    ------
+    AvatarError
+        If the surface cannot be meshed or held; the message names the remedy.
+    """
+    options = options or OrganOptions()
+    elasticity, regions = _problem(surface, options)
+    loads = load_surface(elasticity.mesh, regions, options.patch_radius)
+    return OrganProblem(elasticity, regions, loads)
 
 
 def _problem(surface: SurfaceMesh, options: OrganOptions) -> tuple[Elasticity, Regions]:

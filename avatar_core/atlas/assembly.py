@@ -80,9 +80,9 @@ def _field(
     regions, _ = separate_regions(
         region,
         lambda positions: np.tensordot(space, load[positions], ([1], [2])),
+        rule.regional,
         np.maximum(size, 1e-300),
         mass,
-        rule.regional,
     )
     return separate_field(
         blocks,

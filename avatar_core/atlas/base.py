@@ -12,8 +12,8 @@ from avatar_core.fem.elasticity import Material
 from avatar_core.fem.patch_loads import LoadSurface, load_surface
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.reduction.compact_response import CompactResponse
-from avatar_core.shapes.barycenter import Vectors
-from avatar_core.shapes.registration import Registration, RegistrationRule, Template
+from avatar_core.shapes.registration import Registration, Template, TemplateRule
+from avatar_core.shapes.weights import Vectors
 
 
 class PatientError(AvatarError):
@@ -47,8 +47,8 @@ class PatientBase:
         be a lazy sequence.
     distance_of : Callable[[SurfaceMesh, Registration], ndarray] or None
         Signed distances of a new surface on the same grid, or None.
-    rule : RegistrationRule
-        RegistrationRule of all registrations.
+    rule : TemplateRule
+        TemplateRule of all registrations.
     registration_of : Callable[[str], Registration or None]
         Registration of the anatomy with a hash of its file, or None.
     """
@@ -62,7 +62,7 @@ class PatientBase:
     copies: tuple[int, ...] = ()
     distances: Sequence[FloatArray] | None = None
     distance_of: Callable[[SurfaceMesh, Registration], FloatArray] | None = None
-    rule: RegistrationRule = field(default_factory=RegistrationRule)
+    rule: TemplateRule = field(default_factory=TemplateRule)
     registration_of: Callable[[str], Registration | None] = _unknown
 
 

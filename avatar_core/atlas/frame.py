@@ -11,7 +11,7 @@ from avatar_core.atlas.anatomy import AtlasError
 from avatar_core.common.arrays import FloatArray
 from avatar_core.geometry.level_set import GridBox
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.shapes.registration import RegistrationRule, SimilarityTransform, Template
+from avatar_core.shapes.registration import SimilarityTransform, Template, TemplateRule
 
 LARGEST_ORGAN = (0.33, 0.26, 0.26)  # along x, y, z [m]
 SPACING = 0.009  # gives about 49,000 points with LARGEST_ORGAN, as many as in the paper [m]
@@ -28,13 +28,13 @@ class Frame:
         Registered to every anatomy.
     box : GridBox
         GridBox around the template, at whose points signed distances are taken.
-    rule : RegistrationRule
-        RegistrationRule of all registrations.
+    rule : TemplateRule
+        TemplateRule of all registrations.
     """
 
     template: Template
     box: GridBox
-    rule: RegistrationRule = field(default_factory=RegistrationRule)
+    rule: TemplateRule = field(default_factory=TemplateRule)
 
     @property
     def n_points(self) -> int:

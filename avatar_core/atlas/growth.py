@@ -31,16 +31,15 @@ from avatar_core.atlas.workers import Workers
 from avatar_core.common.processes import repeatable
 from avatar_core.errors import AvatarError, StorageError
 from avatar_core.geometry.doubts import size_notice
-from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.geometry.surface_files import content_of
 from avatar_core.shapes.registration import (
     Registration,
-    RegistrationRule,
     Template,
+    TemplateRule,
     not_converged,
-    register,
+    register_template,
 )
 
 Axes = str | tuple[tuple[float, ...], ...]
@@ -83,14 +82,14 @@ class AtlasOptions:
         Size of the largest organ that fits into the box, along x, y, z [m].
     spacing : float
         Spacing of the grid in the box [m].
-    rule : RegistrationRule
-        RegistrationRule of all registrations.
+    rule : TemplateRule
+        TemplateRule of all registrations.
     """
 
     template_vertices: int = 2500
     largest: tuple[float, float, float] = LARGEST_ORGAN
     spacing: float = SPACING
-    rule: RegistrationRule = field(default_factory=RegistrationRule)
+    rule: TemplateRule = field(default_factory=TemplateRule)
 
 
 @dataclass(frozen=True)
@@ -138,8 +137,7 @@ def new_frame(template: Template, options: AtlasOptions | None = None) -> Frame:
 
 def default_template(n_vertices: int = 2500) -> Template:
     """The built-in liver as a template, with clamp and accessible region by the anatomical rule."""
-    mesh = tetrahedralize(phantom_liver(), n_vertices)
-    return Template("phantom", mesh, regions_by_rule(mesh))
+    return Template.of(phantom_liver(), n_vertices)
 
 
 def create_atlas(
@@ -402,7 +400,7 @@ def build_anatomy(
     """
     surface = source.read() if isinstance(source, SurfaceFile) else source
     frame.require_room(surface)
-    registration = register(frame.template, surface, frame.rule)
+    registration = register_template(frame.template, surface, frame.rule)
     response = solve_response(registration) if solve_response else None
     shape = Anatomy(
         name=surface.name,

@@ -17,8 +17,8 @@ from avatar_core.atlas.anatomy import Anatomy, AtlasError, Duplicate, Response
 from avatar_core.atlas.frame import Frame
 from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.geometry.mesh import TetMesh
-from avatar_core.shapes.barycenter import SAME, Vectors
 from avatar_core.shapes.registration import Registration
+from avatar_core.shapes.weights import SAME, Vectors
 
 Item = TypeVar("Item")
 

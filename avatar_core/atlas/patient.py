@@ -48,9 +48,9 @@ from avatar_core.reduction.galerkin import (
     ReductionRule,
     reduce,
 )
-from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.correspondence import load_map
-from avatar_core.shapes.registration import Registration, register
+from avatar_core.shapes.registration import Registration, register_template
+from avatar_core.shapes.weights import Barycenter
 from avatar_core.vademecum.display import DISPLAYED, Display, organ_display
 from avatar_core.vademecum.model import Convergence, RankError, Vademecum
 from avatar_core.vademecum.tip_field import make_tip_field
@@ -207,7 +207,7 @@ def posed_patient(
     progress("registration", 0.0, np.nan)
     with _timed(clock, "registration"):
         known = base.registration_of(surface.source_sha256)
-        registration = known or register(base.template, surface, base.rule)
+        registration = known or register_template(base.template, surface, base.rule)
     weights = patient_weights(
         base, registration, surface, options.weighting, options.n_neighbors, options.leave_out
     )

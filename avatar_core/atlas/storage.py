@@ -37,9 +37,9 @@ from avatar_core.geometry.level_set import GridBox
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.shapes.registration import (
     RegistrationQuality,
-    RegistrationRule,
     SimilarityTransform,
     Template,
+    TemplateRule,
 )
 
 ATLAS_SCHEMA = "2.0"
@@ -80,7 +80,7 @@ class _Frame:
 
     template: str
     box: GridBox
-    rule: RegistrationRule
+    rule: TemplateRule
     made_from: str
 
 
@@ -187,7 +187,7 @@ def _require_box(box: GridBox) -> None:
         raise StorageError("'about.box' is no grid of this project; build the atlas again")
 
 
-def _require_rule(rule: RegistrationRule) -> None:
+def _require_rule(rule: TemplateRule) -> None:
     loops = (rule.n_stages, rule.sweeps, 1 + rule.last_sweeps)
     finite = all(math.isfinite(value) and value >= 0 for value in asdict(rule).values())
     if not finite or not all(1 <= n <= MOST_STEPS for n in loops) or rule.n_samples > MAX_POINTS:

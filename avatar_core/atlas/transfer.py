@@ -28,9 +28,9 @@ from avatar_core.fem.patch_loads import LoadSurface
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.reduction.compact_response import CompactResponse, positive_part
-from avatar_core.shapes.barycenter import DEFAULT_REGULARIZATION, Barycenter, barycenter
 from avatar_core.shapes.correspondence import interpolation_matrix, load_map
 from avatar_core.shapes.registration import Registration
+from avatar_core.shapes.weights import DEFAULT_REGULARIZATION, Barycenter, barycenter, kriging
 
 Weighting = Literal["kriging", "lle-template", "lle-grid", "lle-paper"]
 # Neighbours and ridge of LLE: the paper's (Sec. 3.3), and those with the least leave-one-out error
@@ -41,8 +41,6 @@ LLE_SETTINGS: dict[str, tuple[int, float]] = {
     "lle-paper": (10, DEFAULT_REGULARIZATION),
 }
 _OVERSAMPLING = 20  # random columns beyond the rank of a combination
-# Exponent of kriging: leave-one-out error of displacement of 46 livers 13.7 %, with 1 16.2 %.
-_VARIOGRAM = 1.8
 
 
 # --- weights ----------------------------------------------------------------------------------
@@ -92,44 +90,6 @@ def patient_weights(
     if weighting == "kriging":
         return kriging(vectors, point, k, left)
     return barycenter(vectors, point, k, regularization=ridge, leave_out=left)
-
-
-def kriging(
-    vectors: Sequence[FloatArray],
-    point: FloatArray,
-    n_neighbors: int,
-    leave_out: Collection[int] = (),
-) -> Barycenter:
-    """Return weights of ordinary kriging with the power variogram gamma(h) = h^1.8 (Matheron 1963).
-
-        [ -D  1 ] [ w ]   [ -d ]
-        [ 1^T 0 ] [ m ] = [  1 ],    D_ij = |X_i - X_j|^1.8, d_i = |X_i - x|^1.8
-
-    Real livers do not lie on a manifold of low dimension. Unlike the weights of Eq. 15, these stay
-    bounded where x cannot be reproduced, and tend to the mean far from the base.
-
-    Parameters
-    ----------
-    vectors : ndarray, shape (n, D)
-    point : ndarray, shape (D,)
-    n_neighbors : int
-        Number of nearest anatomies that get weights.
-    """
-    found = barycenter(vectors, point, n_neighbors, leave_out=leave_out)
-    if found.member is not None:
-        return found
-    chosen = np.stack([vectors[j] for j in found.neighbors])
-    k, scale = len(chosen), float(found.distances.mean())
-    squared = (chosen**2).sum(axis=1)
-    apart = np.sqrt(np.maximum(squared[:, None] + squared - 2.0 * chosen @ chosen.T, 0.0))
-    np.fill_diagonal(apart, 0.0)
-    system = np.ones((k + 1, k + 1))
-    system[:k, :k], system[k, k] = -((apart / scale) ** _VARIOGRAM), 0.0
-    right = np.append(-((found.distances / scale) ** _VARIOGRAM), 1.0)
-    # least squares, as two equal anatomies make the system singular
-    weights = np.linalg.lstsq(system, right, rcond=1e-12)[0][:k]
-    residual = float(np.linalg.norm(point - weights @ chosen))
-    return replace(found, weights=weights, residual=residual)
 
 
 # --- responses ----------------------------------------------------------------------------------

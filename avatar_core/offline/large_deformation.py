@@ -99,9 +99,9 @@ def with_large_deformation(
     regions, errors = separate_regions(
         region,
         lambda positions: paths.fields[:, positions].transpose(2, 1, 0),
+        RegionalRule(rule.mode_tolerance, _WORST_OVER_MEAN * rule.mode_tolerance, rule.max_modes),
         paths.size[:, None] / paths.reach[:, None] ** np.array(POWERS),
         vademecum.mesh.lumped_mass,
-        RegionalRule(rule.mode_tolerance, _WORST_OVER_MEAN * rule.mode_tolerance, rule.max_modes),
     )
     volumes = vademecum.mesh.vertex_volumes
     terms = separate_field(vademecum.blocks, volumes, region, regions, tolerance=PART)

@@ -205,9 +205,9 @@ def modes_of_regions(
     regions, errors = separate_regions(
         region,
         lambda positions: response.remainder(far, positions),
+        rule.regional,
         response.norm.reshape(-1, 3),
         elasticity.mesh.lumped_mass,
-        rule.regional,
         lambda fraction: progress("regions", fraction, NO_ERROR),
     )
     most = max(modes.space.shape[1] for modes in regions)

@@ -326,9 +326,9 @@ def _regions(
     regions, errors = separate_regions(
         region,
         columns,
+        rule,
         np.hstack([s.response.norm.reshape(len(region), 3) for s in snapshots]),
         snapshots[0].elasticity.mesh.lumped_mass,
-        rule,
     )
     most = max(modes.space.shape[1] for modes in regions)
     return regions, rank_errors(fields[0].rank, errors[: most + 1])

@@ -27,8 +27,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from avatar_core.errors import ConvergenceError
-from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import require_orthonormal
+from avatar_core.reduction.operator import Operator, operator_of
 
 # An enrichment that captures less of the total energy than this is made of rounding errors.
 _ROUNDING = 1e-13
@@ -195,18 +195,33 @@ class PGDProblem(Protocol):
 class LoadProblem:
     """A problem whose loads are solved on the way; see :class:`PGDProblem`.
 
-    Attributes
+    Parameters
     ----------
-    elasticity : Elasticity
-        Problem that solves with K and applies it.
-    loads : sparse, shape (3 n_nodes, n_loads)
-        Right-hand sides.
+    operator : Operator or sparse matrix, shape (n_dofs, n_dofs)
+        K, symmetric positive definite: an
+        :class:`avatar_core.fem.elasticity.Elasticity`, or a matrix, which is factored.
+    loads : ndarray or sparse matrix, shape (n_dofs, n_loads)
+        F, one load a column.
+    weights : ndarray, shape (n_loads,), optional
+        Weight of each load in the norm over the loads. The default is 1.
+    energy : ndarray, shape (n_loads,), optional
+        f . K^-1 f of each load. The default solves every load once for it.
     """
 
-    elasticity: Elasticity
-    loads: sp.csr_matrix
-    weights: np.ndarray
-    energy: np.ndarray
+    operator: Operator | sp.spmatrix
+    loads: np.ndarray | sp.csr_matrix
+    weights: np.ndarray = None  # type: ignore[assignment]  # set below
+    energy: np.ndarray = None  # type: ignore[assignment]  # set below
+
+    def __post_init__(self) -> None:
+        operator = operator_of(self.operator)
+        object.__setattr__(self, "operator", operator)
+        if self.weights is None:
+            object.__setattr__(self, "weights", np.ones(self.loads.shape[1]))
+        if self.energy is None:
+            dense = self.loads.toarray() if sp.issparse(self.loads) else self.loads
+            work = np.einsum("is,is->s", dense, operator.solve(dense))
+            object.__setattr__(self, "energy", work)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -220,7 +235,7 @@ class LoadProblem:
 
     def solve(self, amounts: np.ndarray) -> np.ndarray:
         """Return K^-1 F a."""
-        return self.elasticity.solve(self.loads @ amounts)
+        return self.operator.solve(self.loads @ amounts)
 
     def observe(self, space: np.ndarray) -> np.ndarray:
         """Return F^T X."""
@@ -228,7 +243,7 @@ class LoadProblem:
 
     def apply(self, space: np.ndarray) -> np.ndarray:
         """Return K X."""
-        return self.elasticity.apply(space)
+        return self.operator.apply(space)
 
 
 @dataclass(frozen=True)

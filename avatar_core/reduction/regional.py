@@ -74,10 +74,10 @@ def regions_of(centers: FloatArray, n_regions: int) -> IntArray:
 
 def separate_regions(
     region: IntArray,
-    columns: Callable[[IntArray], FloatArray],
-    size: FloatArray,
-    mass: FloatArray,
+    columns: FloatArray | Callable[[IntArray], FloatArray],
     rule: RegionalRule,
+    size: FloatArray | None = None,
+    mass: FloatArray | None = None,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> tuple[list[RegionModes], FloatArray]:
     """Return the modes of every region.
@@ -85,15 +85,17 @@ def separate_regions(
     Parameters
     ----------
     region : ndarray of int32, shape (n_positions,)
-        Region of each load position.
-    columns : Callable[[ndarray of int], ndarray]
-        Function that returns the columns of some positions, shape (3 n_vertices, n, n_loads).
-    size : ndarray, shape (n_positions, n_loads)
-        L2 norms to which errors are relative.
-    mass : ndarray, shape (3 n_vertices,)
-        Lumped mass.
+        Region of each load position, as of :func:`regions_of`.
+    columns : ndarray, shape (n_dofs, n_positions, n_loads), or callable
+        Displacement under each load. A callable gives the columns of some positions, for those
+        that do not fit into memory at once.
     rule : RegionalRule
-    progress : Callable[[float], None]
+        Tolerance, and modes of a region at most.
+    size : ndarray, shape (n_positions, n_loads), optional
+        L2 norm by which an error is relative. The default is the norm of each column.
+    mass : ndarray, shape (n_dofs,), optional
+        Lumped mass of that norm. The default is 1.
+    progress : callable
         Called with the finished fraction.
 
     Returns
@@ -105,13 +107,23 @@ def separate_regions(
         kept.
     """
     parts = []
-    errors = np.empty((rule.most + 1, *size.shape))
+    at: Callable[[IntArray], FloatArray] = (
+        columns if callable(columns) else lambda here: np.asarray(columns)[:, here]
+    )
+    if mass is None:
+        mass = np.ones(len(at(np.zeros(1, np.int64))))
     root = np.sqrt(mass).astype(np.float32)[:, None]
+    if size is None:
+        size = np.stack(
+            [np.linalg.norm(root * at(np.array([j]))[:, 0], axis=0) for j in range(len(region))]
+        )
+        size = np.maximum(size, 1e-300)
+    errors = np.empty((rule.most + 1, *size.shape))
     n_regions = int(region.max()) + 1
 
     def separate(r: int) -> RegionModes:
         here = np.flatnonzero(region == r)
-        scaled = columns(here).reshape(len(mass), -1) * (root / size[here].ravel())
+        scaled = at(here).reshape(len(mass), -1) * (root / size[here].ravel())
         modes, load, left = _principal(scaled.astype(np.float32), rule)
         errors[:, here] = left.reshape(-1, *size[here].shape)
         return _with_peaks_of_one(modes / root, load, size[here])

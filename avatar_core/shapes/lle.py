@@ -17,7 +17,7 @@ from scipy.linalg import eigh
 
 from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import LLEError
-from avatar_core.shapes.barycenter import (
+from avatar_core.shapes.weights import (
     DEFAULT_REGULARIZATION,
     SAME,
     Barycenter,

@@ -23,7 +23,14 @@ from scipy.spatial.transform import Rotation
 
 from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import RegistrationError
-from avatar_core.geometry.mesh import MeshQuality, Regions, TetMesh, quality
+from avatar_core.geometry.mesh import (
+    MeshQuality,
+    Regions,
+    TetMesh,
+    quality,
+    regions_by_rule,
+    tetrahedralize,
+)
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.distortion import Distortion
 from avatar_core.shapes.springs import Target, sample_target, surface_springs
@@ -48,9 +55,15 @@ class Template:
     mesh: TetMesh
     regions: Regions
 
+    @classmethod
+    def of(cls, surface: SurfaceMesh, n_vertices: int = 2850) -> Template:
+        """Make a template of an organ's surface, with clamp and access by the anatomical rule."""
+        mesh = tetrahedralize(surface, n_vertices)
+        return cls(surface.name, mesh, regions_by_rule(mesh))
+
 
 @dataclass(frozen=True)
-class RegistrationRule:
+class TemplateRule:
     """Stiffnesses, number of steps and tolerances of a registration.
 
     Attributes
@@ -226,8 +239,8 @@ def not_converged(quality: RegistrationQuality) -> str:
     )
 
 
-def register(
-    template: Template, surface: SurfaceMesh, rule: RegistrationRule | None = None
+def register_template(
+    template: Template, surface: SurfaceMesh, rule: TemplateRule | None = None
 ) -> Registration:
     """Register the template to a surface: align it, then soften it until its vertices lie on it.
 
@@ -237,7 +250,7 @@ def register(
         If the target is not an organ of the template's kind: its size differs too much, or
         tetrahedra would flatten before its surface is reached.
     """
-    rule = rule or RegistrationRule()
+    rule = rule or TemplateRule()
     target = sample_target(surface, 3 * rule.n_samples)
     alignment, aligned_converged = align_upright(template.mesh, target, rule)
     aligned = alignment(template.mesh.vertices)
@@ -255,7 +268,7 @@ def register(
     return Registration(template, mesh, alignment, reached, tuple(history), converged)
 
 
-def _require_close(reached: RegistrationQuality, name: str, rule: RegistrationRule) -> None:
+def _require_close(reached: RegistrationQuality, name: str, rule: TemplateRule) -> None:
     """Raise RegistrationError, which names each criterion that is not met."""
     failures = []
     if not reached.mean_distance <= rule.largest_mean:
@@ -283,7 +296,7 @@ class _Fit:
     distortion: Distortion
     mesh: TetMesh
     target: Target
-    rule: RegistrationRule
+    rule: TemplateRule
 
     def step(self, x: FloatArray, stiffness: float) -> tuple[FloatArray, RegistrationStep]:
         """Update the springs, then take a Newton step with Armijo's line search."""
@@ -365,7 +378,7 @@ def measure(
 
 
 def align_upright(
-    mesh: TetMesh, target: Target, rule: RegistrationRule, iterations: int = 60
+    mesh: TetMesh, target: Target, rule: TemplateRule, iterations: int = 60
 ) -> tuple[SimilarityTransform, bool]:
     """Return the similarity from template to target near the axes of both, and if it converged.
 

@@ -37,8 +37,8 @@ from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.registration import (
     Registration,
     RegistrationQuality,
-    RegistrationRule,
     SimilarityTransform,
+    TemplateRule,
 )
 from avatar_core.studies.study import Row, Run, Study, column, follow
 
@@ -49,7 +49,7 @@ AT = 100_000  # anatomies of the estimate on paper
 REAL_MB = 5.4  # of a real anatomy: 120 modes, 49,000 points
 BUILD_SECONDS = 15.0  # CPU time of a real one: registration and response
 # an addition takes as long in a small atlas as in a large one, but for what depends on the size
-ROUGH = RegistrationRule(
+ROUGH = TemplateRule(
     n_stages=5, last_sweeps=0, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
 )
 

@@ -18,9 +18,9 @@ from avatar_core.fem.patch_loads import default_patch_radius, load_surface
 from avatar_core.geometry.level_set import GridBox, reinitialize
 from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver, population
-from avatar_core.shapes.barycenter import Barycenter
 from avatar_core.shapes.correspondence import interpolation_matrix
 from avatar_core.shapes.lle import CLEAR_GAP, LLE
+from avatar_core.shapes.weights import Barycenter
 from avatar_core.studies.response import carried, relative_errors, trilinear, unit_load_response
 from avatar_core.studies.shapes import PAPER_GRID, as_grid, distance_vectors, paper_box
 from avatar_core.studies.study import Row, Run, Study, column, follow, mean_and_worst, where

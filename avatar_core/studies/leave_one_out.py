@@ -28,10 +28,10 @@ from avatar_core.geometry.level_set import (
 from avatar_core.geometry.mesh import tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.shapes.barycenter import barycenter_weights, convex_weights
 from avatar_core.shapes.lle import Gram
-from avatar_core.shapes.registration import RegistrationRule, align_upright
+from avatar_core.shapes.registration import TemplateRule, align_upright
 from avatar_core.shapes.springs import sample_target
+from avatar_core.shapes.weights import barycenter_weights, convex_weights
 from avatar_core.studies.shapes import (
     PAPER_GRID,
     FloatArray,
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 K_PAPER = 10
 NEAR = 3.0  # distances are made exact this many spacings around the blended surface
 # The closest fit counts here, whichever way an organ lies: no prior holds it upright.
-FREE = RegistrationRule(rotation_spread=90.0)
+FREE = TemplateRule(rotation_spread=90.0)
 N_TEMPLATE = 1000  # vertices of the mesh of the phantom that is aligned to the livers
 ALIGNMENTS = ("centred", "similarity")
 

@@ -27,6 +27,7 @@ from avatar_core.offline.rule import BuildRule
 from avatar_core.reduction.pgd import LoadProblem, PGDRule, solve_pgd
 from avatar_core.reduction.regional import RegionalRule, regions_of, separate_regions
 from avatar_core.reduction.separated import SeparatedField
+from avatar_core.reduction.snapshots import pod
 from avatar_core.studies.organ import Organ
 from avatar_core.studies.shapes import read_liver
 from avatar_core.studies.study import Row, Run, Study, column, follow, label, where
@@ -209,9 +210,7 @@ def _rows(case: Case, kind: str) -> list[Row]:
 
     greedy = _pgd(case, PGDRule(max(ranks), 1e-12, block=1), relative=False)
     shared = _shared(case, max(ranks))
-    root = np.sqrt(case.mass)[:, None]
-    scaled = root * case.exact / case.size
-    left_vectors = np.linalg.svd(scaled, full_matrices=False)[0]
+    best = pod(case.exact, max(ranks), case.mass, relative=True)
     for rank in follow(ranks, f"{kind} loads"):
         some = greedy.truncate(rank)
         if some.rank == rank:
@@ -219,9 +218,8 @@ def _rows(case: Case, kind: str) -> list[Row]:
             add("PGD, paper's norm", rank, case.exact - _at(case, some), contact)
         left = _two_levels_leave(case, shared, rank)
         add("default", rank, left, np.zeros(n))  # contact is exact at the loads of the build
-        basis = left_vectors[:, :rank]
-        best = basis @ (basis.T @ (scaled * case.size)) / root
-        add("SVD optimum", rank, case.exact - best, np.full(n, np.nan))
+        left = case.exact - best.truncate(rank).evaluate()
+        add("SVD optimum", rank, left, np.full(n, np.nan))
     return found
 
 
@@ -249,7 +247,7 @@ def _two_levels_leave(case: Case, shared: SeparatedField, rank: int) -> FloatArr
     left = case.exact - shared.truncate(rule.n_global).evaluate()
     most = RegionalRule(0.0, 0.0, rank - rule.n_global)
     regions, _ = separate_regions(
-        case.region, lambda at: left[:, at, None], case.size[:, None], case.mass, most
+        case.region, left[:, :, None], most, case.size[:, None], case.mass
     )
     for r, (modes, load) in enumerate(regions):
         left[:, case.region == r] -= modes @ load[:, 0].T

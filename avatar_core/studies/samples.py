@@ -19,8 +19,8 @@ import numpy as np
 from avatar_core.common.arrays import FloatArray
 from avatar_core.common.processes import repeatable
 from avatar_core.geometry.phantom import phantom_liver, population
-from avatar_core.shapes.barycenter import barycenter
 from avatar_core.shapes.lle import LLE
+from avatar_core.shapes.weights import barycenter
 from avatar_core.studies.shapes import PAPER_GRID, distance_vectors, paper_box
 from avatar_core.studies.study import Row, Run, Study, column, follow, label, mean_and_worst, where
 

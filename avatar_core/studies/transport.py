@@ -42,7 +42,6 @@ from avatar_core.atlas.transfer import (
     carried,
     carried_by_place,
     combine,
-    kriging,
     patient_weights,
 )
 from avatar_core.common.processes import cpu_seconds
@@ -51,8 +50,8 @@ from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.mesh import TetMesh, regions_by_rule, tetrahedralize
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.reduction.compact_response import CompactResponse
-from avatar_core.shapes.barycenter import DEFAULT_REGULARIZATION, barycenter
-from avatar_core.shapes.registration import Registration, register
+from avatar_core.shapes.registration import Registration, register_template
+from avatar_core.shapes.weights import DEFAULT_REGULARIZATION, barycenter, kriging
 from avatar_core.studies.shapes import SAME_SUBJECT, read_livers
 from avatar_core.studies.study import Row, Run, Study, column, follow
 from avatar_core.vademecum.model import Vademecum
@@ -274,7 +273,7 @@ def transport_row(surface: SurfaceMesh, base: PatientBase, options: PatientOptio
     name = surface.name
     options = replace(options, leave_out=tuple(leave_one_out(base, name, SAME_SUBJECT)))
     start = cpu_seconds()
-    registration = register(base.template, surface, base.rule)
+    registration = register_template(base.template, surface, base.rule)
     registration_seconds = cpu_seconds() - start
     start = cpu_seconds()
     on_template = template_problem(surface, base, registration)

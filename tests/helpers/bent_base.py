@@ -28,8 +28,8 @@ N_BASE = 5
 def bent_phantoms() -> tuple[PatientBase, SurfaceMesh, Registration]:
     """Return the base, the patient's surface, and the template registered to that surface."""
     organ = phantom_liver(0.012)
-    mesh = tetrahedralize(organ, 300)
-    template = Template("phantom", mesh, regions_by_rule(mesh))
+    template = Template.of(organ, 300)
+    mesh = template.mesh
     loads = load_surface(mesh, template.regions)
     maps = population(N_BASE + 1, seed=3, bend=0.01)
     vertices = np.array([shape(mesh.vertices) for shape in maps])

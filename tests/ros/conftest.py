@@ -282,9 +282,9 @@ def _patients() -> dict[str, bytes]:
     from avatar_core.atlas.workers import Workers
     from avatar_core.geometry.mesh import regions_by_rule, tetrahedralize
     from avatar_core.geometry.phantom import phantom_liver
-    from avatar_core.shapes.registration import RegistrationRule, Template
+    from avatar_core.shapes.registration import Template, TemplateRule
 
-    rough = RegistrationRule(
+    rough = TemplateRule(
         n_stages=5, last_sweeps=0, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
     )
     mesh = tetrahedralize(phantom_liver(12e-3), 300)

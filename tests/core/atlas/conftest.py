@@ -17,7 +17,7 @@ from avatar_core.cli import main as cli
 from avatar_core.geometry.mesh import TetMesh, tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.shapes.registration import RegistrationRule, Template
+from avatar_core.shapes.registration import Template, TemplateRule
 from tests.core.atlas.rough import OPTIONS, Command, N, make_livers, make_template, written
 from tests.helpers.disk_cache import cached_on_disk
 
@@ -67,13 +67,13 @@ def atlas(folder: Path) -> Atlas:
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Record the names of the surfaces that are registered."""
     names: list[str] = []
-    register = atlas_build.register
+    register_template = atlas_build.register_template
 
-    def counted(template: Template, surface: SurfaceMesh, rule: RegistrationRule):
+    def counted(template: Template, surface: SurfaceMesh, rule: TemplateRule):
         names.append(surface.name)
-        return register(template, surface, rule)
+        return register_template(template, surface, rule)
 
-    monkeypatch.setattr(atlas_build, "register", counted)
+    monkeypatch.setattr(atlas_build, "register_template", counted)
     return names
 
 

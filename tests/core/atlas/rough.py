@@ -17,10 +17,10 @@ from avatar_core.atlas.workers import Workers
 from avatar_core.geometry.mesh import TetMesh, regions_by_rule
 from avatar_core.geometry.phantom import phantom_liver, population
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.shapes.registration import RegistrationRule, Template
+from avatar_core.shapes.registration import Template, TemplateRule
 
 # a rough registration, 0.3 s instead of 6 s: the atlas treats it alike
-ROUGH = RegistrationRule(
+ROUGH = TemplateRule(
     n_stages=5, last_sweeps=0, n_samples=800, largest_mean=2e-3, largest_reverse_mean=5e-3
 )
 OPTIONS = AtlasOptions(spacing=0.02, rule=ROUGH)

@@ -13,7 +13,7 @@ import pytest
 from avatar_core.atlas import growth as atlas_build
 from avatar_core.atlas.growth import AtlasOptions
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.shapes.registration import RegistrationRule, Template
+from avatar_core.shapes.registration import Template, TemplateRule
 from tests.core.atlas.rough import ROUGH, Command, files_of, write_obj
 
 
@@ -75,17 +75,17 @@ def test_a_stopped_command_goes_on(
     options = ("--spacing", 0.02, "--jobs", 1, *more)
     file = tmp_path / "atlas"
     files = [write_obj(tmp_path / f"{liver.name}.obj", liver) for liver in livers[:2]]
-    register = atlas_build.register
+    register_template = atlas_build.register_template
 
-    def stopped(template: Template, surface: SurfaceMesh, rule: RegistrationRule):
+    def stopped(template: Template, surface: SurfaceMesh, rule: TemplateRule):
         if surface.name == "liver1":
             raise KeyboardInterrupt
-        return register(template, surface, rule)
+        return register_template(template, surface, rule)
 
-    monkeypatch.setattr(atlas_build, "register", stopped)
+    monkeypatch.setattr(atlas_build, "register_template", stopped)
     code, _, err = run("create", file, *files, *options)
     assert code == 130 and "run the same command again" in err
-    monkeypatch.setattr(atlas_build, "register", register)
+    monkeypatch.setattr(atlas_build, "register_template", register_template)
     code, out, _ = run("create", file, *files, *options)
     assert code == 0 and "1 of 2 added, 1 there before" in out
 

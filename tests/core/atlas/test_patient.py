@@ -21,7 +21,7 @@ from avatar_core.atlas.patient_problem import (
     said_of_missed,
     template_problem,
 )
-from avatar_core.atlas.transfer import Weighting, combine, kriging, patient_weights
+from avatar_core.atlas.transfer import Weighting, combine, patient_weights
 from avatar_core.errors import LLEError, SurfaceError
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.reduction.galerkin import (
@@ -33,7 +33,7 @@ from avatar_core.reduction.galerkin import (
     residual_compliance_blocks,
     solve_probes,
 )
-from avatar_core.shapes.barycenter import barycenter
+from avatar_core.shapes.weights import barycenter, kriging
 from tests.helpers.bent_base import bent_phantoms, patient_mesh, registration_of
 from tests.helpers.known_surfaces import ball
 

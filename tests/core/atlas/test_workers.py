@@ -19,7 +19,7 @@ from avatar_core.atlas.growth import SurfaceFile, create_atlas
 from avatar_core.atlas.storage import load_atlas
 from avatar_core.atlas.workers import Workers
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.shapes.registration import RegistrationRule, Template
+from avatar_core.shapes.registration import Template, TemplateRule
 from tests.core.atlas.rough import ALONE, OPTIONS, write_obj
 
 # --- bad surfaces -----------------------------------------------------------------------------
@@ -28,14 +28,14 @@ from tests.core.atlas.rough import ALONE, OPTIONS, write_obj
 def test_bad_surfaces_are_skipped(
     template: Template, livers: list[SurfaceMesh], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    register = atlas_build.register
+    register_template = atlas_build.register_template
 
-    def sometimes(template: Template, surface: SurfaceMesh, rule: RegistrationRule):
+    def sometimes(template: Template, surface: SurfaceMesh, rule: TemplateRule):
         if surface.name == "liver1":
             raise np.linalg.LinAlgError("singular")
-        return register(template, surface, rule)
+        return register_template(template, surface, rule)
 
-    monkeypatch.setattr(atlas_build, "register", sometimes)
+    monkeypatch.setattr(atlas_build, "register_template", sometimes)
     half = replace(livers[0], faces=livers[0].faces[: len(livers[0].faces) // 2], name="half")
     sources = [
         SurfaceFile(write_obj(tmp_path / "half.obj", half)),

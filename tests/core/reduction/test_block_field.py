@@ -49,7 +49,7 @@ def regions(points: np.ndarray) -> list[RegionModes]:
     columns = np.einsum("vp,dl->vdpl", bump, np.eye(3)).reshape(3 * N, N_POSITIONS, 3)
     size = np.sqrt(np.einsum("x,xpl->pl", np.repeat(VOLUMES, 3), columns**2))
     rule = RegionalRule(1e-3, 5e-3, 20)
-    return separate_regions(REGION, lambda at: columns[:, at], size, np.repeat(VOLUMES, 3), rule)[0]
+    return separate_regions(REGION, columns, rule, size, np.repeat(VOLUMES, 3))[0]
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ REGION = np.repeat([0, 1, 2], N_POSITIONS // 3).astype(np.int32)
 
 def separated(columns: np.ndarray, rule: RegionalRule) -> tuple[list[RegionModes], np.ndarray]:
     size = np.sqrt(np.einsum("x,xij->ij", MASS, columns**2))
-    return separate_regions(REGION, lambda at: columns[:, at], size, MASS, rule)
+    return separate_regions(REGION, lambda at: columns[:, at], rule, size, MASS)
 
 
 def true_errors(regions: list[RegionModes], columns: np.ndarray) -> np.ndarray:

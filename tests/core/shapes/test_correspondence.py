@@ -25,11 +25,11 @@ from avatar_core.shapes.correspondence import (
 from avatar_core.shapes.distortion import Distortion
 from avatar_core.shapes.registration import (
     Registration,
-    RegistrationRule,
     Template,
+    TemplateRule,
     align_upright,
     line_search,
-    register,
+    register_template,
 )
 from avatar_core.shapes.springs import sample_target
 from tests.helpers.disk_cache import cached_on_disk
@@ -57,13 +57,17 @@ def warped() -> Registration:
 @cached_on_disk
 def _warped() -> Registration:
     phantom = phantom_liver()
-    return register(_template(), replace(phantom, vertices=phantom.vertices @ WARP.T + SHIFT))
+    return register_template(
+        _template(), replace(phantom, vertices=phantom.vertices @ WARP.T + SHIFT)
+    )
 
 
 @pytest.fixture(scope="module")
 def itself(template: Template) -> Registration:
     mesh = template.mesh
-    return register(template, SurfaceMesh(mesh.vertices, mesh.boundary_faces.astype(np.int32)))
+    return register_template(
+        template, SurfaceMesh(mesh.vertices, mesh.boundary_faces.astype(np.int32))
+    )
 
 
 def sphere(radius: float) -> SurfaceMesh:
@@ -179,7 +183,7 @@ def test_template_lies_on_an_affinely_warped_organ_without_inversion(warped, pha
     target = replace(phantom, vertices=phantom.vertices @ WARP.T + SHIFT)
     distance = distance_to(target, warped.mesh)
     assert warped.converged
-    assert distance.mean() < RegistrationRule().tolerance
+    assert distance.mean() < TemplateRule().tolerance
     assert distance.mean() == pytest.approx(warped.quality.mean_distance)
     assert warped.mesh.tet_volumes.min() > 0
     assert warped.quality.least_jacobian > 0.2  # the warp itself: 1.21 in every tetrahedron
@@ -220,23 +224,23 @@ def test_template_on_itself_stays(itself, template):
 
 def test_a_shrunken_target_is_refused_with_the_unit_as_remedy(template):
     with pytest.raises(RegistrationError, match="--unit"):
-        register(template, sphere(0.02))
+        register_template(template, sphere(0.02))
 
 
 def test_what_does_not_converge_says_so(template, phantom, warped):
     """A tolerance out of reach, and an alignment stopped after one step."""
     target = replace(phantom, vertices=phantom.vertices @ WARP.T + SHIFT)
-    found = register(template, target, RegistrationRule(tolerance=1e-6, n_stages=3))
+    found = register_template(template, target, TemplateRule(tolerance=1e-6, n_stages=3))
     assert not found.converged and warped.converged and warped.notices == ()
     assert "not converged" in found.notices[0]
     sampled = sample_target(target, 4000)
-    _, converged = align_upright(template.mesh, sampled, RegistrationRule(), iterations=1)
+    _, converged = align_upright(template.mesh, sampled, TemplateRule(), iterations=1)
     assert not converged
 
 
 def test_a_ring_is_refused(template):
     with pytest.raises(RegistrationError, match="out of shape"):
-        register(template, ring(), RegistrationRule(n_stages=7))
+        register_template(template, ring(), TemplateRule(n_stages=7))
 
 
 def test_an_empty_surface_is_refused(template):
@@ -244,7 +248,7 @@ def test_an_empty_surface_is_refused(template):
         np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0.0]]), np.array([[0, 1, 2], [0, 2, 1]])
     )
     with pytest.raises(RegistrationError, match="encloses nothing"):
-        register(template, flat)
+        register_template(template, flat)
 
 
 # --- carried data -----------------------------------------------------------------------------
@@ -357,7 +361,7 @@ def test_points_are_located_where_the_winding_number_says_inside(warped):
 
 def assert_fits(template: Template, surface: SurfaceMesh) -> None:
     """Check the mean distance from the surface, and thin tips: without reach 8 to 13 mm off."""
-    registration = register(template, surface)
+    registration = register_template(template, surface)
     assert distance_to(surface, registration.mesh).mean() < 0.45e-3
     assert registration.mesh.tet_volumes.min() > 0
     assert registration.quality.reverse_mean_distance < 0.9e-3

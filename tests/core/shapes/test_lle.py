@@ -23,7 +23,8 @@ from scipy.optimize import minimize
 from avatar_core.errors import LLEError
 from avatar_core.geometry.level_set import distance_in_box, padded_box
 from avatar_core.geometry.phantom import phantom_liver, population
-from avatar_core.shapes.barycenter import (
+from avatar_core.shapes.lle import LLE, Gram
+from avatar_core.shapes.weights import (
     DEFAULT_REGULARIZATION,
     Barycenter,
     barycenter,
@@ -31,7 +32,6 @@ from avatar_core.shapes.barycenter import (
     convex_weights,
     local_gram,
 )
-from avatar_core.shapes.lle import LLE, Gram
 from tests.helpers.examples import examples
 
 NONE = 1e-12  # nearly no regularisation

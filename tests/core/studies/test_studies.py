@@ -22,9 +22,9 @@ from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.phantom import phantom_liver
 from avatar_core.geometry.surface import SurfaceMesh
-from avatar_core.shapes.barycenter import barycenter
 from avatar_core.shapes.correspondence import interpolation_matrix
 from avatar_core.shapes.lle import Gram
+from avatar_core.shapes.weights import barycenter
 from avatar_core.studies import (
     NAMES,
     accuracy_time,

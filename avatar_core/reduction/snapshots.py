@@ -1,0 +1,54 @@
+"""Proper orthogonal decomposition, the rival of PGD: the best that any n modes can do.
+
+The modes of snapshots U are the left singular vectors of M^(1/2) U D^-1 (Eckart & Young,
+Psychometrika 1, 1936), with the mass M of the norm in space and the size D of each snapshot where
+errors are relative. POD needs every snapshot, and so every solution, before it begins.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from avatar_core.errors import ConvergenceError
+from avatar_core.reduction.separated import SeparatedField
+
+
+def pod(
+    snapshots: ArrayLike, rank: int, mass: ArrayLike | None = None, relative: bool = False
+) -> SeparatedField:
+    """Return the leading POD modes of snapshots, U ~ X Y^T with X^T M X = I.
+
+    Parameters
+    ----------
+    snapshots : array_like, shape (n_dofs, n_loads)
+        U, one solution a column.
+    rank : int
+        Number of modes at most.
+    mass : array_like, shape (n_dofs,), optional
+        M, lumped, of the norm in space. The default is 1 everywhere.
+    relative : bool
+        Whether each snapshot counts relative to its own norm.
+
+    Returns
+    -------
+    SeparatedField
+        Space functions X, shape (n_dofs, r), and load functions Y = U^T M X, shape (n_loads, r).
+
+    Raises
+    ------
+    ConvergenceError
+        If all snapshots are zero, or a number is not finite.
+    """
+    u = np.asarray(snapshots, float)
+    if u.ndim != 2 or not np.isfinite(u).all() or not u.any():
+        raise ConvergenceError(
+            f"snapshots of shape {u.shape} have no modes; give finite columns that are not all zero"
+        )
+    root = np.sqrt(np.ones(len(u)) if mass is None else np.asarray(mass, float))[:, None]
+    scaled = root * u
+    size = np.linalg.norm(scaled, axis=0)
+    counted = scaled / np.where(size > 0.0, size, 1.0) if relative else scaled
+    left, value, _ = np.linalg.svd(counted, full_matrices=False)
+    left = left[:, : min(rank, np.count_nonzero(value > value[0] * np.finfo(float).eps))]
+    return SeparatedField(left / root, scaled.T @ left)
