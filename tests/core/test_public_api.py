@@ -14,10 +14,8 @@ import numpy as np
 import pytest
 
 import avatar_core as av
-from avatar_core import pipeline
-from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.vademecum.model import Vademecum
-from tests.helpers.disk_cache import cached_on_disk
+from tests.helpers.page_code import code_of, run
 from tests.helpers.paths import ROOT
 
 README = ROOT / "README.md"
@@ -91,33 +89,14 @@ def press(model: av.ContactModel, vademecum: Vademecum) -> Sequence[float]:
     return list(data.out.force[0])
 
 
-@cached_on_disk
-def built(n_vertices: int, n_certified: int) -> Vademecum:
-    """Build the built-in liver with the README's options."""
-    options = av.OrganOptions(n_vertices=n_vertices, n_certified=n_certified)
-    return pipeline.build(av.phantom_liver(), options)
-
-
 @pytest.mark.long
 def test_the_lines_of_the_readme_give_the_numbers_beside_them(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Each ``# -> number`` equals the output of its line, to 2 %."""
 
-    def build(surface: SurfaceMesh, options: av.OrganOptions) -> Vademecum:
-        """Return a build of an earlier run of the same code."""
-        found, sizes = av.phantom_liver(), (options.n_vertices, options.n_certified)
-        assert np.array_equal(surface.vertices, found.vertices)
-        assert options == av.OrganOptions(n_vertices=sizes[0], n_certified=sizes[1])
-        return built(*sizes)
-
-    monkeypatch.setattr(av, "build", build)
-    block = re.search(r"<!-- python-example -->\n```python\n(.*?)```", README.read_text(), re.S)
-    assert block is not None
-    code = block[1]
-    promised = [float(number) for number in re.findall(r"# -> (-?[\d.e-]+)", code)]
-    monkeypatch.chdir(tmp_path)
-    exec(compile(code, str(README), "exec"), {})
+    promised = [float(number) for number in re.findall(r"# -> (-?[\d.e-]+)", code_of(README))]
+    run(README, tmp_path, monkeypatch)
     printed = [float(line) for line in capsys.readouterr().out.split()]
     assert len(promised) >= 2
     np.testing.assert_allclose(printed, promised, rtol=0.02)

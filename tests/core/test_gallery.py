@@ -1,0 +1,80 @@
+"""The gallery: each example runs as its page shows it, computes its physics and draws its picture.
+
+``AVATAR_DRAW_GALLERY=1 pytest -m 'long or not long' tests/core/test_gallery.py`` draws the pictures
+of the pages anew.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from tests.helpers.page_code import code_of, run
+from tests.helpers.paths import ROOT
+
+GALLERY = ROOT / "msg_docs" / "gallery"
+LINES, BYTES = 40, 80_000  # of an example, of a picture
+
+Names = dict[str, Any]
+
+
+def effects(names: Names) -> None:
+    """Friction adds to the force, a Prony term takes its part, and a held depth is held."""
+    force = {name: np.array(values) for name, values in names["force"].items()}
+    bare, held = force["bare"], slice(250, 1000)
+    assert np.ptp(bare[held]) < 1e-3 * bare[500]
+    relaxed = force["viscoelasticity"][999] / bare[999]
+    assert 0.6 < relaxed < 0.66  # 1 - g = 0.6, after 2.7 relaxation times
+    assert force["friction"][1150] > 1.04 * bare[1150]  # sqrt(1 + 0.3^2) in slip
+    assert all(0.0 < cost < 1000.0 for cost in names["cost"].values())
+
+
+def touches(names: Names) -> None:
+    """The interval holds the truth, and less is unknown than before."""
+    assert names["low"] < names["truth"] < names["high"]
+    assert names["found"].explained
+    assert names["high"] / names["low"] < 1.6 < 1.33**3.29  # 90 % of what was known before
+
+
+def point_cloud(names: Names) -> None:
+    """The hidden part is found to the noise of a camera."""
+    found, error, hidden = names["found"], names["error"], names["hidden"]
+    assert not found.problems
+    assert error["After"][hidden].mean() < 2.0 < 5.0 < error["Before"][hidden].mean()
+
+
+QUICK: tuple[Callable[[Names], None], ...] = ()
+LONG = (effects, touches, point_cloud)
+
+
+@pytest.mark.parametrize(
+    "check",
+    [*QUICK, *(pytest.param(check, marks=pytest.mark.long) for check in LONG)],
+    ids=lambda check: check.__name__,
+)
+def test_an_example_computes_and_draws_what_its_page_says(
+    check: Callable[[Names], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = check.__name__
+    check(run(GALLERY / f"{name}.md", tmp_path, monkeypatch))
+    drawn = tmp_path / f"{name}.png"
+    assert drawn.stat().st_size < BYTES
+    assert np.ptp(matplotlib.image.imread(drawn)) > 0.5  # no blank sheet
+    if os.environ.get("AVATAR_DRAW_GALLERY"):
+        shutil.copy(drawn, GALLERY)
+
+
+def test_every_page_is_short_tried_and_shows_its_picture() -> None:
+    pages = sorted(GALLERY.glob("*.md"))
+    assert {page.stem for page in pages} == {check.__name__ for check in (*QUICK, *LONG)}
+    for page in pages:
+        assert len(code_of(page).splitlines()) <= LINES, page.name
+        assert f"]({page.stem}.png)" in page.read_text()
+        assert 5_000 < page.with_suffix(".png").stat().st_size < BYTES
