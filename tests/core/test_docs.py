@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
+import shlex
 import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
+import typer
 
+from avatar_core.cli.main import app
 from tests.helpers.paths import ROOT
 
 README, DOCS = ROOT / "README.md", ROOT / "msg_docs"
@@ -76,6 +79,25 @@ def test_the_pages_become_html_without_a_warning(tmp_path: Path) -> None:
     for page in PAGES:
         html = page.relative_to(DOCS).with_suffix(".html").as_posix()
         assert (tmp_path / html).exists() and f'href="{html}"' in first, html
+
+
+def command_lines(page: Path) -> list[str]:
+    """Return the arguments of each ``avatar`` command in blocks of shell code and in spans."""
+    blocks = re.findall(r"^```sh\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
+    lines += re.findall(r"`(avatar [a-z][^`\n]*)`", page.read_text())
+    found = (re.search(r"(?:^|/)avatar (.*)$", line.split("#")[0].strip()) for line in lines)
+    return [match[1] for match in found if match]
+
+
+@pytest.mark.parametrize("page", [README, *PAGES], ids=lambda page: page.name)
+def test_commands_and_options_exist(page: Path) -> None:
+    for line in command_lines(page):
+        words, command = shlex.split(line), typer.main.get_command(app)
+        while words and hasattr(command, "commands"):
+            command = command.commands[words.pop(0)]
+        given = {word.split("=")[0] for word in words if re.match("-[^0-9]", word)}
+        assert given <= {name for each in command.params for name in each.opts}, line
 
 
 def sentences(page: Path) -> list[str]:
