@@ -18,12 +18,16 @@ class AtlasError(AvatarError):
 
 @dataclass(frozen=True)
 class ResponseKind:
-    """How a response was computed.
-
-    material, element, patch_radius [m] : of the finite element solutions
+    """Method by which a response was computed.
 
     Attributes
     ----------
+    material : Material
+        Material of the finite element solutions.
+    element : Element
+        Element of the finite element solutions.
+    patch_radius : float
+        Radius of the load patches [m].
     rank : int
         Number of modes.
     """
@@ -38,7 +42,7 @@ class ResponseKind:
 class Response(CompactResponse):
     """The response of one anatomy on the registered template, in the anatomy's own RAS axes.
 
-    material, element, patch_radius [m] : with which it was computed
+    material, element, patch_radius [m] : of the finite element solutions
     """
 
     material: Material
@@ -47,7 +51,7 @@ class Response(CompactResponse):
 
     @property
     def kind(self) -> ResponseKind:
-        """How it was computed."""
+        """Method by which it was computed."""
         return ResponseKind(self.material, self.element, self.patch_radius, self.load.shape[1])
 
 
@@ -58,13 +62,13 @@ class Origin:
     Attributes
     ----------
     sha256 : str
-        sha256 of its file; empty for a generated surface.
+        SHA-256 of its file; empty for a generated surface.
     unit, axes : str
         Unit and axes of the file.
     n_vertices : int
-        n vertices of the surface.
+        Number of vertices of the surface.
     notices : tuple[str, ...]
-        What was changed on reading, one line each.
+        Changes made on reading, one line each.
     """
 
     sha256: str
@@ -76,7 +80,7 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """The shape of one organ of an atlas: what finds it among others.
+    """The shape of one organ of an atlas, by which it is found among others.
 
     Its level set and its response are read when they are used; see
     :class:`avatar_core.atlas.model.Atlas`.
@@ -84,21 +88,21 @@ class Anatomy:
     Attributes
     ----------
     name : str
-        Unique in the atlas.
+        Name, unique in the atlas.
     key : str
         Hash of the surface and its reading.
     origin : Origin
     volume : float
         Volume [m3].
     alignment : SimilarityTransform
-        SimilarityTransform from the template to the organ.
+        Similarity from the template to the organ.
     registered : ndarray, shape (n_template_vertices, 3)
         The template registered to the organ [m].
     quality : RegistrationQuality
     converged : bool
         Whether the registration converged.
     response : ResponseKind or None
-        ResponseKind; None if there is no response.
+        Kind of its response; None without a response.
     """
 
     name: str
@@ -120,9 +124,9 @@ class WholeAnatomy:
     ----------
     shape : Anatomy
     distances : ndarray, shape (n_points,)
-        Signed distance on the atlas's box [m].
+        Signed distance at the points of the atlas's box [m].
     response : Response or None
-        Response; None if it was not computed.
+        None if it was not computed.
     """
 
     shape: Anatomy

@@ -1,4 +1,4 @@
-"""From a patient's response to a vademecum: sorted modes, regions and what is left near a load."""
+"""Assembly of a patient's vademecum from a response: sorted modes, regions and near field."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from avatar_core.vademecum.tip_field import TipField
 
 
 def surroundings(problem: PatientProblem) -> tuple[TetMesh, Regions, float, SurfaceMesh | None]:
-    """What a tip field is made of."""
+    """Return the inputs of a tip field: mesh, regions, patch radius and outline."""
     return problem.mesh, problem.regions, problem.loads.patch_radius, problem.outline
 
 
@@ -38,10 +38,10 @@ def assembled(
     tip_field: TipField,
     display: Display | None,
 ) -> Vademecum:
-    """The vademecum of a compact response: leading modes as global ones, the rest by regions.
+    """Return the vademecum of a compact response: leading modes are global, the rest by regions.
 
-    support : of the residual compliance [m]
-    rule : of modes and regions
+    support : reach of the residual compliance [m]
+    rule : limits of modes and regions
     """
     loads, modes = problem.loads, _sorted_by_norm(response, problem.mesh)
     n_global, rank = min(rule.n_global, modes.rank), min(rule.contact_modes, modes.rank)
@@ -71,7 +71,7 @@ def assembled(
 def _field(
     modes: SeparatedField, n_global: int, problem: PatientProblem, rule: BuildRule, blocks: Blocks
 ) -> BlockField:
-    """The global modes, and the others separated by regions of the load surface, in blocks."""
+    """Return the global modes, and the others separated by regions, in blocks."""
     mass, region = problem.mesh.lumped_mass, rule.regions(problem.loads)
     root = np.asarray(np.linalg.qr(np.sqrt(mass)[:, None] * modes.space, mode="r"))
     size = np.linalg.norm(modes.load @ root.T, axis=1).reshape(-1, 3)
@@ -97,7 +97,7 @@ def _field(
 def _with_gram_of(
     load: np.ndarray, near: LocalBlocks, surface: LoadSurface, reach: float
 ) -> LocalBlocks:
-    """Return the blocks and the tapered compliance of modes that are left out, Y Y^T."""
+    """Return the blocks plus the tapered compliance Y Y^T of modes that are left out."""
     distance = near.distances(surface.centers)
     zero = replace(near, block=np.zeros_like(near.block))
     left = remainder(zero, load, taper(distance / reach))
@@ -105,7 +105,7 @@ def _with_gram_of(
 
 
 def _sorted_by_norm(response: CompactResponse, mesh: TetMesh) -> SeparatedField:
-    """Modes rotated so that the first hold most of the displacement; Y Y^T does not change."""
+    """Return modes rotated so that the first hold most displacement; Y Y^T does not change."""
     field_ = SeparatedField(np.asarray(response.space, float), np.asarray(response.load, float))
     size = np.maximum((field_.load**2).sum(axis=1), 1e-300)
     sorted_ = field_.sorted_by_norm(mesh.lumped_mass, 1.0 / size)
@@ -113,7 +113,7 @@ def _sorted_by_norm(response: CompactResponse, mesh: TetMesh) -> SeparatedField:
 
 
 def provenance(problem: PatientProblem) -> Provenance:
-    """Return the patient's surface, and the template from which clamp, access and supports are."""
+    """Return the provenance: the patient's surface, and the template of clamp and regions."""
     surface = problem.surface
     held = " ".join(f"{s.name}={s.stiffness:g}" for s in problem.elasticity.supports)
     parameters = {"template": problem.registration.template.name} | (

@@ -72,7 +72,7 @@ def base_of(atlas: Atlas) -> PatientBase:
     Raises
     ------
     PatientError
-        If none has one, or they differ in material, element or patch radius.
+        If no anatomy has a response, or they differ in material, element or patch radius.
     """
     kept = [i for i, anatomy in enumerate(atlas.anatomies) if anatomy.response is not None]
     anatomies = [atlas.anatomies[i] for i in kept]
@@ -109,7 +109,7 @@ def base_of(atlas: Atlas) -> PatientBase:
 
 
 def leave_one_out(base: PatientBase, name: str, same: Collection[Collection[str]]) -> list[int]:
-    """Numbers of the anatomies to leave out for a patient: itself and those of the same person."""
+    """Return the anatomies to leave out for a patient: itself and others of the same person."""
     persons = [set(group) for group in same if name in group]
     return [
         i

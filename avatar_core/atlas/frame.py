@@ -46,6 +46,7 @@ class Frame:
 
         Parameters
         ----------
+        surface : SurfaceMesh
         alignment : SimilarityTransform
             Alignment of its registration, from the template to the organ.
         """
@@ -54,9 +55,9 @@ class Frame:
         return replace(surface, vertices=moved)
 
     def distance_vector(self, surface: SurfaceMesh, alignment: SimilarityTransform) -> FloatArray:
-        """Signed distances of the placed organ at the points of the box, shape (n_points,) [m].
+        """Return signed distances of the placed organ at the points of the box, (n_points,) [m].
 
-        Raises AtlasError if it sticks out of the box.
+        Raises AtlasError if the organ sticks out of the box.
         """
         placed = self.place(surface, alignment)
         if not self.box.margin(placed) > 0.0:
@@ -74,7 +75,7 @@ def box_around(
     largest: tuple[float, float, float] = LARGEST_ORGAN,
     spacing: float = SPACING,
 ) -> GridBox:
-    """Box around the template that holds organs up to a size [m], with some slack.
+    """Return a box around the template for organs up to a size [m], with some slack.
 
     Raises AtlasError if a size or the spacing is not positive, or the grid is unreasonable.
     """

@@ -1,7 +1,8 @@
 """Building an atlas from surfaces, on all cores or a cluster.
 
-Each finished anatomy is written at once into the atlas's folder, and nothing that is there is
-written again. A surface that is there is not built again: that is how a stopped build is resumed.
+Each finished anatomy is written at once into the atlas's folder, and no existing file is written
+again. A surface that is in the atlas is not built again: a stopped build is resumed by running it
+again.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class SurfaceFile:
 
     @property
     def name(self) -> str:
-        """Name of the anatomy: that of the file without suffixes."""
+        """Name of the anatomy: the file's name without suffixes."""
         return self.path.name.split(".")[0]
 
     def read(self) -> SurfaceMesh:
@@ -127,7 +128,7 @@ class Growth:
 
 
 def new_frame(template: Template, options: AtlasOptions | None = None) -> Frame:
-    """Return the frame of an atlas.
+    """Return the frame of a new atlas.
 
     Raises AtlasError if the box or the spacing is unreasonable.
     """
@@ -136,7 +137,7 @@ def new_frame(template: Template, options: AtlasOptions | None = None) -> Frame:
 
 
 def default_template(n_vertices: int = 2500) -> Template:
-    """The built-in liver as a template, with clamp and accessible region by the anatomical rule."""
+    """Return the built-in liver as a template, with clamp and accessible region by rule."""
     return Template.of(phantom_liver(), n_vertices)
 
 
@@ -237,7 +238,7 @@ def _lock(handle: int, folder: Path) -> None:
 
 
 def _begun(folder: Path, options: AtlasOptions, template: Template | None) -> Frame:
-    """Return the frame of a new atlas, or that of a build that was stopped.
+    """Return the frame of a new atlas, or the frame of a build that was stopped.
 
     Meshing a template again would give another mesh: it is made once and kept.
     """
@@ -308,12 +309,12 @@ def _grow(
 
 
 def _items(sources: Sequence[Source], workers: Workers) -> list[Source | Skipped]:
-    """Tasks of the workers: surfaces and not files, if they may not see this machine's files."""
+    """Return workers' tasks: surfaces, not files, if workers may not see this machine's files."""
     return [_read_here(source) if workers.scheduler else source for source in sources]
 
 
 def _names(sources: Sequence[Source], keys: Sequence[str | None], there: Atlas) -> list[str]:
-    """Name of the member that each surface is or becomes; one that is taken gets a number."""
+    """Return the member name that each surface has or gets; a taken name gets a number."""
     taken = {anatomy.name for anatomy in there.anatomies}
     by_key = {anatomy.key: anatomy.name for anatomy in there.anatomies}
     names = []
@@ -327,12 +328,12 @@ def _names(sources: Sequence[Source], keys: Sequence[str | None], there: Atlas) 
 
 
 def _folder_name(name: str) -> str:
-    """Return a name that a folder can have."""
+    """Return a name that is allowed for a folder."""
     return name.replace("/", "_").lstrip(".") or "anatomy"
 
 
 def _growth(there: Atlas, results: Mapping[int, Anatomy | Skipped], names: list[str]) -> Growth:
-    """Return result with members in the order of the surfaces, whatever the order of completion."""
+    """Return the result with members in the order of the surfaces, not of completion."""
     ordered = [results[number] for number in sorted(results)]
     new = [one for one in ordered if isinstance(one, Anatomy)]
     members = sorted((*there.anatomies, *new), key=lambda one: one.name)
@@ -351,7 +352,7 @@ def _growth(there: Atlas, results: Mapping[int, Anatomy | Skipped], names: list[
 
 
 def key_of(source: Source) -> str | None:
-    """Hash of the content of a surface and how it is read; None for a file that cannot be read."""
+    """Return a hash of a surface's content and its reading; None for an unreadable file."""
     digest = hashlib.sha256()
     if isinstance(source, SurfaceFile):
         try:
@@ -370,13 +371,13 @@ def key_of(source: Source) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class AnatomyBuilder:
-    """Builds the anatomies of an atlas; picklable, so that workers can do it."""
+    """Builder of an atlas's anatomies; picklable, so that workers can use it."""
 
     frame: Frame
     solve_response: SolveResponse | None = None
 
     def __call__(self, source: Source | Skipped) -> WholeAnatomy | Skipped:
-        """The anatomy of a surface, or the reason why there is none; never raises."""
+        """Return the anatomy of a surface, or the reason why there is none; never raises."""
         if isinstance(source, Skipped):
             return source
         try:
@@ -396,7 +397,7 @@ def build_anatomy(
     Raises
     ------
     AvatarError
-        Of the stage that failed, with the remedy.
+        From the stage that failed, with the remedy.
     """
     surface = source.read() if isinstance(source, SurfaceFile) else source
     frame.require_room(surface)

@@ -1,7 +1,7 @@
 """An atlas: a folder of anatomies on one frame, whose shapes are held in memory.
 
-A new patient is found by shape. Level sets and responses take a hundred times the memory and are
-read for those anatomies alone that are used.
+A new patient is found by shape. Level sets and responses take a hundred times the memory. They are
+read only for the anatomies that are used.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ MOST_NEIGHBORS = 64
 
 
 class Lazy(Sequence[Item], Generic[Item]):
-    """A sequence whose items are made when they are asked for; the last used ones are kept.
+    """A sequence whose items are made on access; the last used ones are kept.
 
     Parameters
     ----------
     make : Callable[[int], Item]
-        Item of a number.
+        Function that returns the item of a number.
     n : int
         Length.
     kept : int
-        How many items are kept.
+        Number of items that are kept.
     """
 
     def __init__(self, make: Callable[[int], Item], n: int, kept: int = 0) -> None:

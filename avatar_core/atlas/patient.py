@@ -1,10 +1,10 @@
 """A new patient's vademecum from a base of anatomies, at three fidelities.
 
-``interpolated`` combines the neighbours' responses node by node on the registered template
-(Eq. 18): nothing is meshed or solved. ``reduced`` uses their load functions to span a Galerkin
-space on the patient's own mesh, and enriches it. ``solved`` is the full build. These two share the
-patient's mesh, and the clamp and accessible region transferred from the template. Supports hold a
-patient that is ``reduced`` or ``solved``.
+``interpolated`` combines the neighbours' responses node by node on the registered template (Eq.
+18): nothing is meshed or solved. ``reduced`` uses their load functions to span a Galerkin space on
+the patient's own mesh, and enriches it. ``solved`` is the full build. The last two use the
+patient's mesh, and the clamp and accessible region transferred from the template. Supports may hold
+a patient that is ``reduced`` or ``solved``.
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ def posed_patient(
 ) -> tuple[PatientProblem, Barycenter]:
     """Return a patient registered and meshed, with clamp and access, before anything is solved.
 
-    Parameters and errors as of :func:`patient_vademecum`.
+    For parameters and errors see :func:`patient_vademecum`.
     """
     require_fidelity(fidelity)
     if (options.groups is not None or options.supports) and fidelity == "interpolated":
@@ -233,7 +233,7 @@ def build_patient(
     progress: Progress = silent,
     clock: dict[str, float] | None = None,
 ) -> Patient:
-    """The vademecum of a patient that is registered and meshed; see :func:`patient_vademecum`."""
+    """Build the vademecum of a registered and meshed patient; see :func:`patient_vademecum`."""
     require_fidelity(fidelity)
     clock = {} if clock is None else clock
     estimates: tuple[GalerkinErrorEstimate, ...] = ()
@@ -273,12 +273,12 @@ def require_fidelity(fidelity: str) -> None:
 def interpolated(
     problem: PatientProblem, base: PatientBase, weights: Barycenter, options: PatientOptions
 ) -> Vademecum:
-    """Eq. 18: no equation of the patient is solved.
+    """Return the vademecum by Eq. 18: no equation of the patient is solved.
 
-    ``lle-paper`` combines at common positions, as in the paper, the others nodewise on the
-    template. The contact compliance includes the residual compliance that the base holds for each
-    patch. Balls feel the smooth surface: what facets and folds change is less than the error of the
-    response.
+    ``lle-paper`` combines at common positions, like the paper; the other weightings combine
+    nodewise on the template. The contact compliance includes the base's residual compliance of each
+    patch. Balls touch the smooth surface: the effect of facets and folds is less than the error of
+    the response.
     """
     response = interpolated_response(problem, base, weights, options)
     support = RESIDUAL_SUPPORT * problem.loads.patch_radius
@@ -291,7 +291,7 @@ def interpolated(
 def interpolated_response(
     problem: PatientProblem, base: PatientBase, weights: Barycenter, options: PatientOptions
 ) -> CompactResponse:
-    """The combined response at the vertices and load positions of the registered template."""
+    """Return the combined response at the registered template's vertices and load positions."""
     if options.weighting == "lle-paper" and weights.member is None:
         around = (problem.registration, problem.elasticity, problem.loads)
         return carried_by_place(base, weights, *around, options.max_modes)
@@ -305,7 +305,7 @@ def reduced(
     options: PatientOptions,
     progress: Progress = silent,
 ) -> tuple[Vademecum, tuple[GalerkinErrorEstimate, ...]]:
-    """The vademecum of :func:`reduced_response`, and the error estimate after each enrichment."""
+    """Return the vademecum of :func:`reduced_response`, and the estimate after each enrichment."""
     found = reduced_response(problem, base, weights, options, progress)
     return vademecum_of_reduced(problem, found, options), found.history
 
@@ -317,7 +317,7 @@ def reduced_response(
     options: PatientOptions,
     progress: Progress = silent,
 ) -> ReducedResponse:
-    """Galerkin projection on the patient's own mesh; see :mod:`avatar_core.reduction.galerkin`."""
+    """Project on the patient's own mesh (Galerkin); see :mod:`avatar_core.reduction.galerkin`."""
     combined = combine(base.responses, weights, options.reduction.n_start)
     positions = load_map(problem.registration, base.loads, problem.loads.centers)
     functions = by_component(positions, combined.load.astype(float))
@@ -338,7 +338,7 @@ def reduced_response(
 def vademecum_of_reduced(
     problem: PatientProblem, found: ReducedResponse, options: PatientOptions
 ) -> Vademecum:
-    """What contact needs around a response: sorted modes, regions, distance and access."""
+    """Return the vademecum of a response: sorted modes, regions, distance and access."""
     convergence = Convergence(
         found.converged,
         options.tolerance,
@@ -352,7 +352,7 @@ def vademecum_of_reduced(
 def solved(
     problem: PatientProblem, options: PatientOptions, progress: Progress = silent
 ) -> Vademecum:
-    """Return the full finite elements for every load position."""
+    """Return the vademecum by full finite elements for every load position."""
     return build_vademecum(
         problem.surface.name,
         problem.elasticity,
@@ -376,7 +376,7 @@ def _display(problem: PatientProblem, options: PatientOptions) -> Display | None
 def certified(
     vademecum: Vademecum, problem: PatientProblem, n_loads: int, progress: Progress = silent
 ) -> Vademecum:
-    """The vademecum with a certificate: its errors on unseen loads against full finite elements."""
+    """Return vademecum with a certificate: its errors against finite elements on unseen loads."""
     return vademecum.with_certificate(
         certify(
             vademecum,
@@ -420,7 +420,7 @@ def _warnings(
     fidelity: Fidelity,
     vademecum: Vademecum,
 ) -> tuple[str, ...]:
-    """What did not converge, and where the patient lies among the anatomies of the base."""
+    """Return what did not converge, and the patient's place among the base's anatomies."""
     lines = [*registration.notices, *weights.notices]
     away = weights.hull_distance / max(float(weights.distances.mean()), 1e-300)
     if weights.member is not None:

@@ -33,10 +33,10 @@ class PatientProblem:
         Surface of the patient.
     registration : Registration
         Registration of the template to it.
-    mesh, regions, loads, elasticity : TetMesh
-        The patient's.
+    mesh, regions, loads, elasticity : TetMesh, Regions, LoadSurface, Elasticity
+        Mesh and problem of the patient.
     notices : tuple[str, ...]
-        What is doubtful of the organ, one line each.
+        Doubts about the organ, one line each.
     """
 
     surface: SurfaceMesh
@@ -49,8 +49,9 @@ class PatientProblem:
 
     @property
     def outline(self) -> SurfaceMesh | None:
-        """What tools touch: the surface, or None for the boundary of a registered template, which
-        lies beside it.
+        """Surface that tools touch; None for the boundary of a registered template.
+
+        The registered template lies beside the surface.
         """
         return None if self.mesh is self.registration.mesh else self.surface
 
@@ -67,9 +68,13 @@ def patient_problem(
 
     Parameters
     ----------
+    surface : SurfaceMesh
+    base : PatientBase
+    registration : Registration
+    mesh : TetMesh
     groups : Mapping[str, ndarray] or None
         Points of the clamp, the accessible region and supports, in place of the template's
-        (:mod:`avatar_core.geometry.groups`); without supports, of both regions.
+        (:mod:`avatar_core.geometry.groups`). Without supports, both regions are needed.
     supports : Sequence[SupportOption]
         Supports that hold the organ instead of the clamp.
 
@@ -92,7 +97,7 @@ def patient_problem(
 
 
 def template_places(registration: Registration, mesh: TetMesh) -> dict[str, np.ndarray]:
-    """Faces of a patient's mesh where the template is accessible, and where its attachments are."""
+    """Return the faces of a patient's mesh at the template's accessible region and attachments."""
     template = registration.template
     parts = attachments_by_rule(template.mesh) | {"accessible": template.regions.accessible}
     return carry_faces(registration, mesh, parts)
@@ -101,12 +106,14 @@ def template_places(registration: Registration, mesh: TetMesh) -> dict[str, np.n
 def template_problem(
     surface: SurfaceMesh, base: PatientBase, registration: Registration, member: int | None = None
 ) -> PatientProblem:
-    """A patient on the registered template: no mesh is made, and responses combine node by node.
+    """Return a patient on the registered template: without a mesh of its own.
+
+    Responses combine node by node.
 
     Parameters
     ----------
     member : int or None
-        An anatomy of the base that the patient is, on whose own template its response is.
+        Anatomy of the base that is the patient, on whose own template its response is.
     """
     template, own = base.template, registration
     if member is not None:
@@ -126,14 +133,14 @@ def distances_to_mesh(problem: PatientProblem) -> np.ndarray:
 
 
 def missed(problem: PatientProblem) -> tuple[float, np.ndarray]:
-    """Largest distance of the patient's surface to the mesh [m], and its place, shape (3,) [m]."""
+    """Return the largest distance of the patient's surface to the mesh [m], and its place (3,)."""
     distance = distances_to_mesh(problem)
     worst = int(np.argmax(distance))
     return float(distance[worst]), problem.surface.vertices[worst]
 
 
 def missed_part(problem: PatientProblem) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [m] and faces of the patient's surface with a corner ``MISSED`` off the mesh."""
+    """Return the vertices [m] and faces of the surface with a corner ``MISSED`` off the mesh."""
     faces = problem.surface.faces
     far = faces[(distances_to_mesh(problem) > MISSED)[faces].any(axis=1)]
     used, local = np.unique(far, return_inverse=True)
@@ -141,7 +148,7 @@ def missed_part(problem: PatientProblem) -> tuple[np.ndarray, np.ndarray]:
 
 
 def said_of_missed(problem: PatientProblem) -> str:
-    """Return the line that says how far a registered template is off the patient."""
+    """Return a line with the distance of a registered template from the patient."""
     far, (x, y, z) = missed(problem)
     return (
         f"interpolated on a registered template, which is up to {1e3 * far:.1f} mm off the surface "

@@ -14,7 +14,7 @@ from avatar_core.shapes.registration import Registration
 
 @dataclass(frozen=True)
 class ResponseSolver:
-    """Computes the response of an anatomy; picklable.
+    """Solver of an anatomy's response; picklable.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class ResponseSolver:
     rank: int = 120
 
     def __call__(self, registration: Registration) -> Response:
-        """The response to patch loads at the template's load positions on the registered organ."""
+        """Return the response to patch loads at the template's load positions on the organ."""
         template = registration.template
         loads = load_surface(template.mesh, template.regions)
         centers = registered_positions(registration, loads)

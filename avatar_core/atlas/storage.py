@@ -1,7 +1,7 @@
 """Atlases on disk: a folder that grows, in which no file is ever written again.
 
 Every file is HDF5 with the attributes ``format``, ``schema``, ``about`` (JSON: everything that is
-no array) and ``checksum`` as of vademecums (schema 2.0):
+no array) and ``checksum``, computed like a vademecum's (schema 2.0):
 
     frame.h5               template/vertices (n_v, 3) [m], template/tets (n_t, 4),
                            template/clamped and template/accessible over the boundary faces
@@ -9,8 +9,8 @@ no array) and ``checksum`` as of vademecums (schema 2.0):
     NAME/response.h5       space (3 n_v, k) [m/N], load (3 n_s, k), missing (n_s, 3, 3), if computed
     NAME/shape.h5          registered (n_v, 3) [m]
 
-``about`` of the first two files of an anatomy is the key in its shape. The shape is written last:
-a folder without one is no member. Deleting its folder removes an anatomy.
+``about`` of an anatomy's first two files is the key in its shape. The shape is written last: a
+folder without a shape is no member. Deleting its folder removes an anatomy.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ _AGAIN = "delete the anatomy's folder and add its surface again"
 
 @dataclass(frozen=True)
 class _Frame:
-    """Everything of a frame that is no array; made_from: hash of what was asked for."""
+    """Everything of a frame that is no array; made_from: hash of the build's inputs."""
 
     template: str
     box: GridBox
@@ -152,7 +152,7 @@ def save_frame(folder: Path, frame: Frame, made_from: str) -> None:
 
 
 def load_frame(folder: Path) -> tuple[Frame, str]:
-    """Return the frame of an atlas, and the hash of what it was made from.
+    """Return the frame of an atlas, and the hash of its inputs.
 
     Raises StorageError unless the folder is an atlas of this version.
     """
@@ -203,7 +203,7 @@ def save_anatomy(folder: Path, anatomy: WholeAnatomy) -> None:
     Raises
     ------
     StorageError
-        If the folder cannot be made or the disk is full; the atlas is then as it was.
+        If the folder cannot be made or the disk is full; the atlas is then unchanged.
     """
     shape, response = anatomy.shape, anatomy.response
     own = folder / shape.name

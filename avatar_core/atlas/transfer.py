@@ -1,14 +1,14 @@
-"""From a base of anatomies to a patient: weights, and the combined response (Eq. 18).
+"""Transfer from a base of anatomies to a patient: weights, and the combined response (Eq. 18).
 
 The same template mesh is registered to all anatomies. Their elastic responses are stored on it as
 u_i(x, s) = X_i(x) Y_i(s)^T, with C_i = Y_i Y_i^T the compliance between load positions. With
 weights w, the compliance of a patient is
 
     C = sum_i w_i C_i ~ Y Y^T,    its leading positive part,
-    u = sum_i w_i u_i ~ X Y^T,    X = sum_i w_i X_i Y_i^T Y (Y^T Y)^-1,
+    u = sum_i w_i u_i ~ X Y^T,    X = sum_i w_i X_i Y_i^T Y (Y^T Y)^-1.
 
-so that the combined response is separated, and its contact compliance symmetric and positive, even
-if weights are negative.
+The combined response is therefore separated, and its contact compliance symmetric and positive,
+even if weights are negative.
 """
 
 from __future__ import annotations
@@ -58,12 +58,17 @@ def patient_weights(
 
     Parameters
     ----------
+    base : PatientBase
+    registration : Registration
+    surface : SurfaceMesh
     weighting : Weighting
-        "kriging", see :func:`kriging`, and "lle-template", Eq. 15, both on the centred registered
-        vertices; "lle-grid", Eq. 15 on the distances at the common grid; "lle-paper", the same as
-        in the paper, with ten neighbours and almost no ridge.
+        "kriging" (:func:`kriging`) and "lle-template" (Eq. 15) use the centred registered vertices.
+        "lle-grid" is Eq. 15 on the distances at the common grid. "lle-paper" is the paper's form of
+        it, with ten neighbours and almost no ridge.
     n_neighbors : int or None
         k; None for the 64 nearest, 40 with "lle-template" and 10 with "lle-paper".
+    leave_out : Collection[int]
+        Anatomies that get no weight.
 
     Raises
     ------
@@ -98,15 +103,17 @@ def patient_weights(
 def combine(
     responses: Sequence[CompactResponse], weights: Barycenter, rank: int = 100
 ) -> CompactResponse:
-    """Eq. 18 nodewise on the template; a member of the base keeps its own response exactly.
+    """Combine responses by Eq. 18 nodewise; a member of the base keeps its response exactly.
 
     The leading part of C is found by two subspace iterations on random columns (Halko, Martinsson &
-    Tropp, SIAM Review 53, 2011), which use every response three times and never form C.
+    Tropp, SIAM Review 53, 2011). They use every response three times and never form C.
 
     Parameters
     ----------
+    responses : Sequence[CompactResponse]
+    weights : Barycenter
     rank : int
-        Maximum number of modes.
+        Largest number of modes.
     """
     if weights.member is not None:
         return responses[weights.member]
@@ -130,7 +137,10 @@ def leading_loads(
 
     Returns
     -------
-    vectors : ndarray, shape (3 n_positions, r), orthonormal, r <= rank; values : shape (r,) [m/N]
+    vectors : ndarray, shape (3 n_positions, r)
+        Orthonormal eigenvectors, r <= rank.
+    values : ndarray, shape (r,)
+        Eigenvalues [m/N].
     """
     n_loads = len(terms[0][1].load)
 
@@ -168,16 +178,20 @@ def carried(
     elasticity: Elasticity,
     surface: LoadSurface,
 ) -> CompactResponse:
-    """A response on the template, interpolated to the vertices and load positions of a patient.
+    """Interpolate a template response to a patient's vertices and load positions.
 
     Displacements of the clamped vertices are set to zero.
 
     Parameters
     ----------
+    response : CompactResponse
+    registration : Registration
     loads : LoadSurface
-        LoadSurface of the template.
+        Load positions of the template.
+    elasticity : Elasticity
+        Problem of the patient.
     surface : LoadSurface
-        Surface that of the patient.
+        Load positions of the patient.
     """
     mesh = elasticity.mesh
     fields = interpolation_matrix(registration.mesh, mesh.vertices)
@@ -193,11 +207,11 @@ def carried_by_place(
     surface: LoadSurface,
     rank: int = 100,
 ) -> CompactResponse:
-    """Eq. 18 at common coordinates, as in the paper: x and s are positions, not material points.
+    """Combine responses by Eq. 18 at common coordinates: x and s are positions, like in the paper.
 
-    The centroids of all organs coincide; a point outside an anatomy takes the displacement of its
-    closest point. Evaluated at the patient's own points, which avoids the interpolation error of
-    the paper's grid.
+    The centroids of all organs coincide. A point outside an anatomy takes the displacement of its
+    closest point. Evaluation at the patient's own points avoids the interpolation error of the
+    paper's grid.
     """
     mesh, here = elasticity.mesh, registration.mesh.centroid
     moved = []

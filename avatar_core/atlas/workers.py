@@ -1,8 +1,8 @@
 """Independent tasks on this machine's cores or on a Dask cluster.
 
 Results arrive in the order in which they are ready. A task whose process dies yields an error; the
-others are done all the same. With concurrent.futures, as with joblib, a process that dies breaks
-its whole pool: that is why unfinished tasks then get a pool each.
+other tasks are still done. With concurrent.futures, as with joblib, a process that dies breaks its
+whole pool. Unfinished tasks then get a pool each.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ CONNECT_SECONDS = 10  # for a scheduler to answer
 
 @dataclass(frozen=True)
 class Workers:
-    """Where tasks run.
+    """Place where tasks run.
 
     Raises AtlasError if there are no jobs.
 
@@ -38,7 +38,8 @@ class Workers:
     jobs : int or None
         Processes on this machine; None for one per CPU, 1 for this process.
     scheduler : str or None
-        Address of a Dask scheduler whose workers run them instead; they need avatar, too.
+        Address of a Dask scheduler whose workers run the tasks instead; the workers need avatar,
+        too.
     """
 
     jobs: int | None = None
@@ -51,14 +52,14 @@ class Workers:
     def map(
         self, function: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterator[tuple[int, Result | Exception]]:
-        """Return the number of each item with its result, or with the error that ended it.
+        """Yield the number of each item with its result, or with the error that ended it.
 
         Raises AtlasError if no scheduler answers.
 
         Parameters
         ----------
-        function, items : Callable[[Item], Result]
-            Picklable, unless there is one job.
+        function, items
+            Function of one item, and the items; picklable, unless there is one job.
         """
         numbered = dict(enumerate(items))
         jobs = min(self.jobs or len(os.sched_getaffinity(0)), len(items))
@@ -75,7 +76,7 @@ class Workers:
 def _in_processes(
     function: Callable[[Item], Result], items: dict[int, Item], jobs: int
 ) -> Iterator[tuple[int, Result | Exception]]:
-    """In one pool; once a process has died, each unfinished task gets a pool of its own."""
+    """Run items in one pool; once a process has died, each unfinished item gets its own pool."""
     left = dict(items)
     for number, result in _in_pool(function, items, jobs):
         del left[number]
@@ -120,7 +121,7 @@ def _follow_parent() -> None:
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Limit processes that are started meanwhile to one thread each: there is one per core."""
+    """Limit processes that start in the body to one thread each: there is one per core."""
     limits = thread_limits()
     before = {name: os.environ.get(name) for name in limits}
     os.environ.update(limits)

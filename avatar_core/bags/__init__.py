@@ -1,3 +1,5 @@
-"""Bags of ROS 2, without ROS. MCAP or sqlite3 of a tool's poses and wrenches come in; a recording
-goes out, which is replayed as those of the planning page are. Recordings are written as MCAP.
+"""Bags of ROS 2, without ROS.
+
+A tool's poses and wrenches come in, as MCAP or sqlite3. A recording goes out, which is replayed
+like those of the planning page. Recordings are written as MCAP.
 """

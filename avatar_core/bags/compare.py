@@ -1,8 +1,8 @@
-"""Which periods of a bag can be compared with a replay.
+"""Choice of the periods of a bag that can be compared with a replay.
 
-A ``contact_state`` holds the computed force. A wrench holds what the force guard made of it, so
-that it is compared only where the guard passes the replayed force as it is, and with a margin of
-some periods, as a bag tells times only by those of receipt.
+A ``contact_state`` holds the computed force. A wrench holds the force after the force guard. It is
+compared only where the guard passes the replayed force unchanged. Some periods of margin are left
+out, because a bag knows only times of receipt.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def comparable(path: BagPath, found: Replayed, limits: ForceLimits) -> Replayed:
 
 
 def why_not(path: BagPath) -> str:
-    """Why no period of a bag can be compared, and the remedy."""
+    """Return the reason why no period of a bag can be compared, and the remedy."""
     if not path.recording.from_rest:
         effects = {effect.name for effect in scene_of(path.recording).effects}
         if held := sorted(effects & set(REMEMBER_FOR_EVER)):

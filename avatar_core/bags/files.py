@@ -1,8 +1,8 @@
 """Opening bags: a folder, or a single .mcap or .db3; whole or damaged, compressed or not.
 
-The files of a folder are read one by one. Its metadata.yaml only tells which they are: that a file
-or a message is compressed is seen from its beginning. What can be read is read, and a note says
-what could not.
+The files of a folder are read one by one. Its metadata.yaml only lists them. Whether a file or a
+message is compressed is seen from its first bytes. Readable messages are read, and a note names the
+rest.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ def is_bag(path: Path) -> bool:
 class OpenBag:
     """A bag that is being read; a context manager, which closes it.
 
-    Parameters
+    Attributes
     ----------
-    connections
-        The library's, one for each topic, type and file.
-    notes
-        What could not be read, one line each.
+    connections : list
+        The library's connections, one for each topic, type and file.
+    notes : list[str]
+        Unreadable parts, one line each.
 
     Raises
     ------
@@ -118,7 +118,7 @@ class OpenBag:
         except FileNotFoundError:
             self.notes.append(f"{path} has no metadata.yaml; its files are read one by one")
             return files
-        except Exception as error:  # whatever is no such file
+        except Exception as error:  # any error for a file of another kind
             self.notes.append(
                 f"{path} is damaged ({one_line(error, 120)}); its files are read one by one"
             )
@@ -153,7 +153,7 @@ class OpenBag:
             return self._reader_of_file(self._decompressed(file))
         try:
             return self._opened(file)
-        except Exception as error:  # whatever the library raises for what is no such file
+        except Exception as error:  # any error that the library raises for a file of another kind
             reader = self._recovered(file) if file.suffix == MCAP else None
             if reader is None:
                 raise StorageError(
@@ -162,18 +162,18 @@ class OpenBag:
             return reader
 
     def _decompressed(self, file: Path) -> Path:
-        """Return a copy of a compressed file, as far as it goes, for as long as the bag is open."""
+        """Return a copy of a compressed file, as far as it goes, kept while the bag is open."""
         folder = self._stack.enter_context(TemporaryDirectory(prefix="avatar_bag_"))
         whole = Path(folder) / file.stem
         try:
             with zstd().open(file, "rb") as packed, whole.open("wb") as out:
                 shutil.copyfileobj(packed, out)
-        except Exception as error:  # whatever the library raises for what is no such file
+        except Exception as error:  # any error that the library raises for a file of another kind
             self.notes.append(f"{file} is damaged ({one_line(error, 120)})")
         return whole
 
     def _recovered(self, file: Path) -> Any:
-        """A reader of the whole records of a file that was not closed; None if there are none."""
+        """Return a reader of the whole records of an unclosed file; None if there are none."""
 
         def opens(part: Any) -> bool:
             try:
@@ -194,18 +194,18 @@ class OpenBag:
 
 
 def _is_storage(file: Path) -> bool:
-    """Return whether a file's name is that of messages, compressed or not."""
+    """Return whether a file's name is that of a message file, compressed or not."""
     return (file.with_suffix("") if file.suffix == _ZSTD else file).suffix in SUFFIXES
 
 
 def _in_order(file: Path) -> list[str | int]:
-    """Sorts bag_10 behind bag_2."""
+    """Return a sort key that puts bag_10 behind bag_2."""
     parts = re.split(r"(\d+)", file.name)
     return [int(part) if part.isdecimal() else part for part in parts]
 
 
 def _unpacked(content: bytes) -> bytes:
-    """Return a message, whether it was compressed or not."""
+    """Return a message decompressed, if it was compressed."""
     if content[:4] != _ZSTD_BEGINS:
         return content
     try:

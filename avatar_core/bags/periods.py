@@ -1,14 +1,14 @@
 """From the tables of a bag to a recording: one period for each answer of the contact loop.
 
-Each ``contact_state``, or where there are none each wrench, was sent by one period of the loop, and
-its stamp is that of the pose that the period used. Where a bag has neither, each pose is taken for
-a period, and there is nothing to compare with.
+Each ``contact_state``, or without states each wrench, was sent by one period of the loop. Its stamp
+is the stamp of the pose that the period used. If a bag has neither, each pose is taken for a
+period, and there is nothing to compare with.
 
-The loop does not number its messages, so that an answer that a recorder lost cannot be told from
-one that was never sent because the loop was late. With effects that remember the path, periods are
-taken to be lost where two answers were received more than ``_GAP`` periods apart: too little may be
-compared, but nothing wrongly. Without, the force follows from the tip of the moment, and periods
-are lost where answers are missing for longer than a pose is held, and the tip moved meanwhile.
+The loop does not number its messages. An answer that a recorder lost cannot be told from one that
+was never sent because the loop was late. With effects that remember the path, periods count as lost
+where two answers were received more than ``_GAP`` periods apart. Too little may be compared, but
+nothing wrongly. Without such effects, the force follows from the present tip. Periods then count as
+lost where answers are missing for longer than a pose is held, and the tip moved meanwhile.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ class BagPath:
     recording : Recording
         Its forces are zero if ``answers`` is "poses".
     answers : str
-        "states", "wrenches" or "poses", which of them the periods are.
-    received : ndarray
-        (n,) when each answer was received [ns].
-    sound : ndarray
-        (n,) whether the pose was valid, as far as the bag shows.
+        Messages that the periods come from: "states", "wrenches" or "poses".
+    received : ndarray of int, shape (n,)
+        Time of receipt of each answer [ns].
+    sound : ndarray of bool, shape (n,)
+        Whether the pose was valid, as far as the bag shows.
     notes : tuple[str, ...]
-        What was left out, one line each.
+        Messages that were left out, one line each.
     """
 
     recording: Recording
@@ -76,15 +76,16 @@ def path_of(
 
     Parameters
     ----------
+    bag : Bag
     scene : str
         YAML of the scene of one tool.
     vademecum_id : str
-        Vademecum id of the organ that the tool is to touch; states of others are left out.
+        Id of the organ's vademecum; states of others are left out.
     transform : tuple[float, ...] or None
-        Pose of the poses' frame in the organ's, x y z [m] and quaternion x y z w; None if they are
-        in the organ's.
+        Pose of the poses' frame in the organ's, x y z [m] and quaternion x y z w; None if the
+        frames are equal.
     rate : float or None
-        Rate of the loop [Hz]; None for that of the answers.
+        Rate of the loop [Hz]; None for the rate of the answers.
 
     Raises
     ------
@@ -143,7 +144,7 @@ def valid_tips(
 ) -> tuple[Table, FloatArray, list[str]]:
     """Return the valid poses, their tips in the organ's frame (n, 3) [m], and notes.
 
-    transform, errors : as of :func:`path_of`
+    For transform and errors see :func:`path_of`.
     """
     poses, _, notes = _valid_poses(bag, transform)
     tip = _moved(poses.values[:, :3], *_parts(transform or IDENTITY))
@@ -157,7 +158,7 @@ _AT_POSE, _AWAY, _NONE, _MISSING = range(4)  # where the tip of a period was
 def _valid_poses(
     bag: Bag, transform: tuple[float, ...] | None
 ) -> tuple[Table, np.ndarray, list[str]]:
-    """The poses that the loop takes, times of receipt of those that it refuses, and notes."""
+    """Return accepted poses, times of receipt of refused ones, and notes."""
     if not len(bag.poses):
         raise StorageError(f"{bag.path}: {bag.tool}/measured_cp is empty; record it again")
     frames, labels = bag.poses.label, bag.poses.labels
@@ -194,7 +195,7 @@ def _answers(bag: Bag, poses: Table) -> tuple[str, Table]:
 
 
 def _rate(received: np.ndarray) -> float:
-    """That of the answers, to three digits [Hz].
+    """Return the rate of the answers, to three digits [Hz].
 
     Raises
     ------
@@ -211,21 +212,21 @@ def _rate(received: np.ndarray) -> float:
 
 
 def _leaps(tip: FloatArray) -> np.ndarray:
-    """Whether the tip moved farther than a contact is followed, or was not known, shape (n,)."""
+    """Return where the tip moved farther than a contact is followed, or was unknown, shape (n,)."""
     with np.errstate(invalid="ignore", over="ignore"):
         moved = np.linalg.norm(np.diff(tip, axis=0, prepend=tip[:1]), axis=1)
         return np.asarray(~(moved <= _FOLLOWED))
 
 
 def _numbers(received: np.ndarray, rate: float, lost: np.ndarray) -> np.ndarray:
-    """Return numbers of the periods, shape (n,); a gap counts where it ends in a ``lost`` one."""
+    """Return the numbers of the periods, shape (n,); a gap counts if it ends in a ``lost`` one."""
     periods = np.diff(received, prepend=received[:1]) * (rate * 1e-9)
     steps = np.where((periods > _GAP) & lost, np.rint(periods), 1.0).astype(np.int64)
     return np.cumsum(steps)
 
 
 def _pose_of(poses: Table, answered: Table, answers: str) -> np.ndarray:
-    """The pose of each answer's stamp, the last received before it if there are several; or -1."""
+    """Return the pose of each answer's stamp, the last received before it, or -1."""
     if answers == "poses":
         return np.arange(len(poses))
     order = np.argsort(poses.stamp, kind="stable")  # and so by the time of receipt
@@ -239,7 +240,7 @@ def _pose_of(poses: Table, answered: Table, answers: str) -> np.ndarray:
 
 
 def _placement(answers: str, table: Table, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the status of each period, and where its tip was."""
+    """Return the status of each period, and the place of its tip."""
     n = len(table)
     if answers == "states":
         status = table.values[:, 0].astype(np.uint8)
@@ -264,7 +265,7 @@ def _is_stale(wrenches: Table) -> np.ndarray:
 
 
 def _of_organ(answers: str, table: Table, vademecum_id: str) -> np.ndarray:
-    """Whether a period answered for that organ, shape (n,); true where the bag does not say."""
+    """Return whether periods answered for that organ, shape (n,); true if the bag does not say."""
     if answers != "states":
         return np.ones(len(table), bool)
     mine = [name == vademecum_id for name in table.labels]
@@ -295,14 +296,15 @@ def _parts(transform: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
 
 
 def _moved(points: FloatArray, origin: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Into the organ's frame; bit by bit the same if both frames are one."""
+    """Return points in the organ's frame; bit by bit the same if both frames are one."""
     turned = points if np.array_equal(rotation, np.eye(3)) else points @ rotation.T
     return turned + origin
 
 
 def _turned(orientations: FloatArray, frame: FloatArray) -> FloatArray:
-    """Quaternions (n, 4) in the organ's frame, as the loop finds them; bit by bit the same if both
-    frames are one.
+    """Return quaternions (n, 4) in the organ's frame, computed like in the loop.
+
+    They are bit by bit the same if both frames are one.
     """
     if np.array_equal(frame, IDENTITY[3:]):
         return orientations
@@ -312,7 +314,7 @@ def _turned(orientations: FloatArray, frame: FloatArray) -> FloatArray:
 def _forces(
     bag: Bag, answers: str, table: Table, poses: Table, row: np.ndarray, rotation: FloatArray
 ) -> FloatArray:
-    """Forces on the tool in the organ's frame, shape (n, 3) [N]; zero where the bag has none."""
+    """Return forces on the tool in the organ's frame, (n, 3) [N]; zero if the bag has none."""
     if answers == "states":
         return table.values[:, 1:4]
     if answers == "poses":

@@ -1,4 +1,4 @@
-"""From a bag to the tables of one tool: its poses, and what answers them."""
+"""From a bag to the tables of one tool: its poses, and their answers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class About:
-    """What a recording says of itself, as in :class:`avatar_core.scene.recording.Recording`."""
+    """Metadata of a recording, as in :class:`avatar_core.scene.recording.Recording`."""
 
     vademecum_id: str
     vademecum_name: str
@@ -36,7 +36,7 @@ class About:
 
     @staticmethod
     def parse(text: str) -> About | None:
-        """From JSON; None if the text is anything else."""
+        """Return the metadata from JSON; None if the text is anything else."""
         try:
             held = json.loads(text)
             if held.pop("format") != FORMAT:
@@ -50,13 +50,13 @@ class About:
         return about if whole and 0.0 < rate < 1e6 else None
 
     def text(self) -> str:
-        """As JSON."""
+        """Return the metadata as JSON."""
         return json.dumps({"format": FORMAT, **asdict(self)})
 
 
 @dataclass(frozen=True, eq=False)
 class Bag:
-    """What a bag holds of one tool.
+    """Contents of a bag for one tool.
 
     Attributes
     ----------
@@ -71,14 +71,14 @@ class Bag:
     axes : str
         Axes of the wrenches: "absolute", "body" or "spatial".
     states : Table or None
-        Label: id of the vademecum; values: status, force of the contacts [N], its estimated error
-        [N], fraction that was sent; None if the bag has none.
+        Label: id of the vademecum. Values: status, force of the contacts [N], its estimated error
+        [N], fraction that was sent. None if the bag has none.
     vademecum_ids : tuple[str, ...]
-        Vademecum ids that the bag names.
+        Ids of vademecums that the bag names.
     about : About or None
-        About of the recording that was written as a bag; None in other bags.
+        Metadata of the recording that was written as a bag; None in other bags.
     notes : tuple[str, ...]
-        What could not be read or was left out, one line each.
+        Unreadable or left-out messages, one line each.
     """
 
     path: Path
@@ -108,14 +108,14 @@ def read_bag(
     tool : str or None
         Beginning of its topics' names, with or without namespace; None if there is only one.
     progress : Progress or None
-        Called with the messages that were read, and how many there are.
+        Called with the number of messages read, and of all.
     wrenches : Mapping[str, str]
-        Topics of a tool that are read, and their axes; the first that has messages is taken.
+        Topics of a tool that are read, and their axes; the first with messages is taken.
 
     Raises
     ------
     StorageError
-        If rosbags is not installed, nothing can be read, or there is no such tool.
+        If rosbags is not installed, nothing can be read, or the tool is missing.
     """
     path = Path(path)
     with OpenBag(path) as bag:
@@ -155,7 +155,7 @@ def _chosen_tool(bag: OpenBag, tool: str | None) -> str:
 
 
 class _Topics:
-    """The topics of a tool and those that all tools share, message by message."""
+    """The topics of a tool and those common to all tools, message by message."""
 
     def __init__(self, connections: Sequence[Any], tool: str, wrenches: Mapping[str, str]) -> None:
         self._tool, self._axes, self._store = tool, wrenches, types.typestore()
@@ -199,7 +199,7 @@ class _Topics:
     def _read(self, content: bytes, kind: str) -> Any:
         try:
             return self._store.deserialize_cdr(content, kind)
-        except Exception:  # whatever the library raises for what is no such message
+        except Exception:  # any error that the library raises for a message of another type
             return None
 
     def bag(self, path: Path, notes: Sequence[str]) -> Bag:
@@ -230,7 +230,7 @@ class _Topics:
         )
 
     def _set_back(self) -> list[int]:
-        """By how much the clock was set back each time [ns]; nothing unless all topics saw it."""
+        """Return amounts by which the clock was set back [ns]; none unless all topics saw it."""
         topics = (self._poses, *self._wrenches.values(), *self._states.values())
         each = [one.set_back() for one in topics if len(one)]
         if len({len(steps) for steps in each}) != 1 or not each[0]:
@@ -238,8 +238,9 @@ class _Topics:
         return [int(step) for step in np.median(each, axis=0)]
 
     def _states_of_tool(self) -> TableWriter | None:
-        """States that name the tool; those of another name if they are the only ones, as remapped
-        topics are.
+        """Return states that name the tool, or the only ones there are.
+
+        Remapped topics leave states with another name.
         """
         for name, states in self._states.items():
             if self._tool.endswith(f"/{name}"):
@@ -288,6 +289,6 @@ class _Topics:
 
 
 def _stamp(message: Any) -> int:
-    """Return [ns]"""
+    """Return the stamp of a message [ns]."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)

@@ -25,16 +25,16 @@ class Table:
 
     Attributes
     ----------
-    received : ndarray
-        (n,) when each was received [ns].
-    stamp : ndarray
-        (n,) of its header [ns].
-    label : ndarray
-        (n,) index into ``labels``.
+    received : ndarray of int, shape (n,)
+        Time of receipt [ns].
+    stamp : ndarray of int, shape (n,)
+        Stamp of the header [ns].
+    label : ndarray of int, shape (n,)
+        Index into ``labels``.
     labels : tuple[str, ...]
-        Texts, such as frames.
-    values : ndarray
-        (n, m).
+        Texts, e.g. frames.
+    values : ndarray, shape (n, m)
+        Numbers of each message.
     """
 
     received: np.ndarray
@@ -54,12 +54,12 @@ class Table:
 
 
 class TableWriter:
-    """Collects rows of ``width`` numbers.
+    """Collector of rows of ``width`` numbers.
 
-    Parameters
+    Attributes
     ----------
-    refused
-        Messages that could not be decoded.
+    refused : int
+        Number of messages that could not be decoded.
     """
 
     def __init__(self, width: int) -> None:
@@ -94,7 +94,7 @@ class TableWriter:
         self._values.extend(values)
 
     def set_back(self) -> list[int]:
-        """By how much the clock was set back, time after time [ns]."""
+        """Return the amounts by which the clock was set back, time after time [ns]."""
         steps = np.diff(np.array(self._received, np.int64))
         back = steps < -_BACK
         if not 0 < back.sum() <= _FEW:
@@ -105,7 +105,7 @@ class TableWriter:
     def table(self, set_back: Sequence[int] = ()) -> Table:
         """Return the collected messages, sorted by the time of receipt; repeated messages once.
 
-        set_back : as of :meth:`set_back`, of all topics
+        set_back : results of :meth:`set_back` for all topics
         """
         received = np.array(self._received, np.int64)
         if set_back:

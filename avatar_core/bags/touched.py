@@ -42,13 +42,14 @@ class TouchFile:
 
     Attributes
     ----------
+    path : Path
     tool : str or None
-        Tool of a bag of several tools, NAME of the topics NAME/measured_cp; of a recording, number
-        of the tool, from 1; None: the only one.
+        Name of the tool, as in NAME/measured_cp, for a bag with several tools. For a recording,
+        number of the tool, from 1. None: the only tool.
     transform : tuple[float, ...] or None
-        Transform of a bag, pose of the poses' frame in the organ's: position [m] and quaternion.
+        Pose of a bag's frame in the organ's: position [m] and quaternion.
     radius : float
-        Radius of a bag, of the spherical tip [m].
+        Radius of a bag's spherical tip [m].
     """
 
     path: Path
@@ -58,12 +59,12 @@ class TouchFile:
 
 
 class Touched(NamedTuple):
-    """Tip of a tool, times (n,) [s], positions (n, 3) [m] and forces, as a file has them.
+    """Tip of a tool, times (n,) [s], positions (n, 3) [m] and forces from a file.
 
     Attributes
     ----------
-    vector : ndarray
-        (n, 3) [N], in the sensor's axes.
+    vector : ndarray, shape (n, 3)
+        Forces in the sensor's axes [N].
     """
 
     tip: Tip
@@ -93,8 +94,8 @@ def measured_path(file: TouchFile, progress: Progress | None = None) -> Touched:
     """Read ``measured_cp`` and ``measured_cf`` of a tool; ``servo_cf`` where there is no sensor.
 
     Forces are linear in time between wrenches, and NaN far from any. Times are those of the
-    headers, or of receipt where these do not tell when something was measured. Notes say what was
-    left out, and where the forces come from.
+    headers. If these do not tell when something was measured, times are those of receipt. Notes
+    name left-out messages and the source of the forces.
 
     Raises
     ------
@@ -182,15 +183,15 @@ def calibrated_files(
     radius: float | None,
     given: Sequence[str],
 ) -> dict[str, Any]:
-    """What ``avatar calibrate`` writes as JSON, with the verdict on the fit as ``verdict``.
+    """Return the JSON of ``avatar calibrate``, with the verdict on the fit as ``verdict``.
 
-    recording, tool, transform, radius : as of :class:`TouchFile`, None for its default
-    given : what is known before, as ``young=lognormal:5300:1.5``
+    recording, tool, transform, radius : see :class:`TouchFile`, None for its default
+    given : prior knowledge, e.g. ``young=lognormal:5300:1.5``
 
     Raises
     ------
     AvatarError
-        As of what reads the files, and :func:`avatar_core.uncertainty.calibration.touch_table`.
+        From reading the files, and from :func:`avatar_core.uncertainty.calibration.touch_table`.
     """
     known = dict(parse(one) for one in given)
     touched = read_touched(TouchFile(recording, tool, transform, radius or RADIUS))

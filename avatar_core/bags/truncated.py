@@ -1,7 +1,7 @@
-"""An MCAP file that was never closed, up to where it is whole.
+"""An MCAP file that was never closed, up to its last whole record.
 
-A recorder that is killed leaves no footer and no index, and often half a record. Such a file is
-shown to the library as one that ends, with an empty footer, behind its last whole record.
+A recorder that is killed leaves no footer and no index, and often half a record. The library is
+given the file as one that ends, with an empty footer, behind its last whole record.
 
 Layout (https://mcap.dev/spec): magic, then records of opcode (1 byte), length (8 bytes, little
 endian) and content; footer; magic.
@@ -44,7 +44,7 @@ def whole_records(path: Path) -> list[int]:
 def longest_readable(path: Path, opens: Callable[[CutPath], bool]) -> CutPath | None:
     """Return the longest part of a file from its beginning that the library opens; None: none.
 
-    opens : whether it opens a part; if it does not, it opens no longer one
+    opens : whether the library opens a part; if it does not, it opens no longer part
     """
     ends = whole_records(path)
     n = bisect_left(ends, True, key=lambda end: not opens(CutPath(path, end)))
@@ -52,9 +52,9 @@ def longest_readable(path: Path, opens: Callable[[CutPath], bool]) -> CutPath | 
 
 
 class CutPath:
-    """A path whose file ends, with a footer, behind so many bytes.
+    """A path whose file ends, with a footer, behind a number of bytes.
 
-    It has what the library asks of a path (``rosbags.interfaces.typing.RPath``).
+    It has the methods that the library needs of a path (``rosbags.interfaces.typing.RPath``).
     """
 
     def __init__(self, path: Path, end: int) -> None:
@@ -65,12 +65,15 @@ class CutPath:
         return str(self._path)
 
     def exists(self) -> bool:
+        """Return whether the file exists."""
         return self._path.exists()
 
     def is_dir(self) -> bool:
+        """Return False: the path is a file."""
         return False
 
     def open(self, *_: object, **__: object) -> BinaryIO:
+        """Open the cut file for reading."""
         return io.BufferedReader(_CutFile(self._path, self.end))
 
 

@@ -17,7 +17,7 @@ STATE = "avatar_ros/msg/ContactState"
 CONTACT = "avatar_ros/msg/Contact"
 INFO = "avatar_ros/msg/VademecumInfo"
 
-# As in avatar_ros/msg, which the core does not have; those that a bag carries are not compiled.
+# Same as avatar_ros/msg, which the core does not have; definitions in a bag are not compiled.
 OWN = {
     CONTACT: """
 geometry_msgs/Point position

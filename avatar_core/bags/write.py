@@ -27,9 +27,9 @@ _METADATA_VERSION = 9  # of rosbag2 in Jazzy
 def write_mcap(recording: Recording, path: str | Path) -> None:
     """Write a recording as one MCAP file, which appears complete or not at all.
 
-    Topics: ``/NAME/measured_cp``, ``/NAME/servo_cf`` (the force that was sent), ``/contact_state``
-    (the computed one, as one contact at the tip) and, once, ``/recording`` (scene and vademecum, as
-    JSON). Clouds are left out.
+    Topics are ``/NAME/measured_cp``, ``/NAME/servo_cf`` (the sent force) and ``/contact_state``
+    (the computed force, as one contact at the tip). ``/recording`` comes once (scene and vademecum,
+    as JSON). Clouds are left out.
 
     Raises
     ------

@@ -4,8 +4,8 @@ The organ's force f_k is sent as F_k. While the poses are valid,
 
     F_k = F_k-1 + clip(g_k clip(f_k, F_max) - F_k-1, S dt),    clip(v, m) = v min(1, m / |v|),
 
-with F_max the largest force, S the largest slew rate and g the engagement: 0 until poses have been
-valid for ``SETTLING``, then growing to 1 over ``ENGAGEMENT``. After a fault at t_0,
+with F_max the largest force, S the largest slew rate and g the engagement. g is 0 until poses have
+been valid for ``SETTLING``, then grows to 1 over ``ENGAGEMENT``. After a fault at t_0,
 
     F(t) = F(t_0) max(0, 1 - (t - t_0) / RAMP),
 
@@ -13,7 +13,7 @@ independent of S and to its end, even if poses are valid again in the meantime. 
 costs at least RAMP, SETTLING and ENGAGEMENT, and no force returns at once. In ordinary use F = f,
 bit by bit: sliding and pressing reach neither limit.
 
-Torque is scaled as its force.
+Torque is scaled like its force.
 """
 
 from __future__ import annotations
@@ -60,11 +60,11 @@ DEVICES = {
 class ForceGuard:
     """The force on one tool, limited in every period.
 
-    Parameters
+    Attributes
     ----------
-    sent_fraction
-        |F| / |f|, of the organ's force that is sent; 1 if that is zero.
-    limited
+    sent_fraction : float
+        Sent fraction |F| / |f| of the organ's force; 1 if that is zero.
+    limited : bool
         Whether a limit is active.
     """
 
@@ -96,9 +96,13 @@ class ForceGuard:
         Parameters
         ----------
         now : float
-            Any steady clock [s].
+            Time of any steady clock [s].
         sound : bool
             Whether the tool's pose is valid.
+        force : ndarray, shape (3,)
+            Force [N].
+        torque : ndarray, shape (3,)
+            Torque [N m].
         """
         period, self._last = min(max(now - self._last, 0.0), _LONGEST), now
         x, y, z = float(force[0]), float(force[1]), float(force[2])
@@ -118,7 +122,7 @@ class ForceGuard:
         self.sent_fraction = math.hypot(*sent[:3]) / size if 0.0 < size < math.inf else 1.0
 
     def _fail(self, now: float) -> None:
-        """Start the ramp, unless that of an earlier fault is under way."""
+        """Start the ramp, unless the ramp of an earlier fault is under way."""
         if now - self._sound >= SETTLING:
             self._fault = now
             self._falling = self._sent

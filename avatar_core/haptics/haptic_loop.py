@@ -4,9 +4,9 @@ The organ is a spring below zero; the tool and the operator's grip are linear,
 
     m x'' + b x' + k x = F + p,
 
-with F the organ's force and p the operator's push. Both are constant over a period, so that the
-matrix exponential gives the motion exactly, and with it the energy that the tool puts into the
-port, sum - F (x' - x).
+with F the organ's force and p the operator's push. Both are constant over a period. The matrix
+exponential therefore gives the motion exactly, and the energy that the tool puts into the port, sum
+- F (x' - x).
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ class Loop:
 
     Attributes
     ----------
+    device : Device
     stiffness : float
         Stiffness of the organ [N/m].
     delay : int
@@ -85,7 +86,7 @@ class Trace(NamedTuple):
 def run_loop(
     loop: Loop, push: FloatArray, start: float = 0.0, passivity: Passivity | None = None
 ) -> Trace:
-    """Return the loop from rest at ``start`` under the operator's push, shape (n_periods,) [N]."""
+    """Run the loop from rest at ``start`` under the operator's push, shape (n_periods,) [N]."""
     trace = Trace(*(np.zeros(len(push)) for _ in Trace._fields))
     transition = loop.device.transition(PERIOD)
     _run(*transition, loop.stiffness, loop.delay, loop.resolution, push, start, passivity, trace)
@@ -95,7 +96,7 @@ def run_loop(
 def oscillation_growth(
     loop: Loop, depth: float = 5e-3, offset: float = 1e-3, n: int = 4000
 ) -> float:
-    """Return growth of an oscillation about a constant push: its last peaks over its first ones."""
+    """Return the growth of an oscillation about a constant push: last peaks over first ones."""
     push = np.full(n, -loop.stiffness * depth)
     deviation = np.abs(run_loop(loop, push, offset - depth).position + depth)
     return float(deviation[-n // 4 :].max() / deviation[: n // 4].max())
@@ -104,9 +105,9 @@ def oscillation_growth(
 def stability_border(stiffness: float, delay: int, mass: float = 1.0) -> float:
     """Return damping of a tool without grip at which oscillations neither grow nor decay [N s/m].
 
-    By bisection to 0.1 %; near K (T / 2 + delay T) if m is large (Gil et al., J. Comput. Inf. Sci.
-    Eng. 9:011005, 2009), as is the damping that passivity requires (Colgate & Schenkel, J. Robotic
-    Systems 14:37, 1997).
+    Bisection finds it to 0.1 %. It is near K (T / 2 + delay T) if m is large (Gil et al., J.
+    Comput. Inf. Sci. Eng. 9:011005, 2009). So is the damping that passivity requires (Colgate &
+    Schenkel, J. Robotic Systems 14:37, 1997).
 
     Raises
     ------

@@ -1,9 +1,9 @@
-"""Load shedding: show fewer modes as soon as the machine is overloaded, more again with hysteresis.
+"""Load shedding: fewer modes as soon as the machine is overloaded, more again with hysteresis.
 
 A window of steps is *overloaded* if too many periods were missed or steps took longer than the
-deadline, *calm* if almost none were and there is a margin. One overloaded window sheds a level, a
-number of calm ones in a row restores one; if the machine is then overloaded again, that number
-doubles. The lowest level is never shed; the force does not depend on what is shown.
+deadline. It is *calm* if almost none were missed and there is a margin. One overloaded window sheds
+a level; a number of calm ones in a row restores one. If the machine is then overloaded again, that
+number doubles. The lowest level is never shed; the force does not depend on the shown modes.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ _LONGEST = 80  # windows
 
 
 class Shedder:
-    """Chooses the number of modes from one window to the next.
+    """Controller of the number of modes from one window to the next.
 
     Parameters
     ----------
     levels : Sequence[int]
-        Numbers of modes, the largest for a machine that is not overloaded.
+        Numbers of modes; the largest is for a machine that is not overloaded.
     deadline : float
         Deadline of a step [s]; infinity for none.
     """
@@ -47,14 +47,14 @@ class Shedder:
         return self._level < len(self._levels) - 1
 
     def update(self, missed: float, step_p99: float) -> int:
-        """Return the modes to show after a window. Real-time safe, though meant for once a window.
+        """Return the number of modes after a window. Real-time safe; meant for once a window.
 
         Parameters
         ----------
         missed : float
             Fraction of its periods that were missed.
         step_p99 : float
-            99th percentile of its steps' times [s]; NaN of none.
+            99th percentile of its steps' times [s]; NaN without steps.
         """
         if missed > OVERLOADED or step_p99 > self._deadline:
             self._shed()

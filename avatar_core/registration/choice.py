@@ -1,4 +1,4 @@
-"""Which kind of loads explains a cloud, by what each predicts of patches that are left out."""
+"""Choice of the kind of loads for a cloud, by their predictions of left-out patches."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _ALIKE = 2.0  # scores within this factor leave both kinds in question
 def posed(
     vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule
 ) -> tuple[Problem, tuple[str, ...]]:
-    """Problem to be fitted, without background, and notices of what was left out, one line each.
+    """Return the problem to be fitted, without background, and notices of points left out.
 
     Raises RegistrationError if the cloud cannot be one of this organ.
     """
@@ -49,10 +49,10 @@ def _off(vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule) -> float:
 
 
 def chosen(problem: Problem) -> tuple[Fit, tuple[Alternative, ...]]:
-    """Return the fit of the kind that is asked for, or of that which predicts best.
+    """Return the fit of the kind that is asked for, or of the kind that predicts best.
 
-    Beside it, where another kind predicts the points that were left out about as well, its answer
-    with its weight.
+    Other kinds that predict the left-out points about as well are returned beside it, with their
+    weights.
     """
     if problem.rule.kind is not None:
         return fit(problem, problem.rule.kind), ()
@@ -72,7 +72,7 @@ def chosen(problem: Problem) -> tuple[Fit, tuple[Alternative, ...]]:
 
 
 def score(problem: Problem, kind: Kind) -> float:
-    """Return the root mean square distance of points from what the others predict of them [m]."""
+    """Return the root mean square distance of points from their prediction by the others [m]."""
     patches, square = patches_of(problem.points), []
     for number in range(_FOLDS):
         left = patches == number
@@ -89,6 +89,6 @@ def score(problem: Problem, kind: Kind) -> float:
 
 
 def patches_of(points: FloatArray) -> IntArray:
-    """Number of the patch of each point, shape (n,): the nearest of points far from one another."""
+    """Return each point's patch, shape (n,): the nearest of points far from one another."""
     middles = points[farthest_points(points, _FOLDS + 1)[1:]]
     return np.asarray(np.linalg.norm(points[:, None] - middles[None], axis=2).argmin(axis=1))

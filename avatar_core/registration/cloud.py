@@ -136,7 +136,7 @@ def read_cloud(path: str | Path, unit: str = "mm", axes: str | ArrayLike | None 
 
 
 def without_background(cloud: Cloud, vertices: FloatArray, faces: IntArray) -> Cloud:
-    """Return the cloud without points far off the organ, such as a table, with a notice.
+    """Return the cloud without points far off the organ, e.g. a table, with a notice.
 
     vertices, faces : of the organ's surface at rest, shapes (n, 3) [m] and (m, 3)
     """
@@ -158,8 +158,9 @@ def require_on_organ(
     """Raise RegistrationError, naming unit or axes, unless a cloud may lie on an organ.
 
     vertices, faces : of the organ's surface at rest, shapes (n, 3) [m] and (m, 3)
-    moved_off : median distance of a cloud from the organ moved rigidly to it [m]: other axes are
-        suspected only if that, too, is smaller with x and y reversed, as a deformation is no turn
+    moved_off : median distance of a cloud from the rigidly moved organ [m]. Other axes are
+        suspected only if that, too, is smaller with x and y reversed, because a deformation is no
+        turn.
     """
     ratio = cloud.extent / float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if not _LEAST_EXTENT <= ratio <= _MOST_EXTENT:
@@ -188,7 +189,7 @@ def require_on_organ(
 
 
 def _fits_turned(cloud: Cloud, moved_off: Callable[[Cloud], float] | None) -> bool:
-    """Return whether a rigid motion brings the cloud to the organ with x and y reversed alone."""
+    """Return whether a rigid motion brings the cloud to the organ only with x and y reversed."""
     if moved_off is None:
         return True
     turned = replace(cloud, points=cloud.points * [-1.0, -1.0, 1.0])
@@ -271,7 +272,7 @@ def _require_points(name: str, lines: list[str], rows: list[list[str]]) -> None:
 
 
 def _named(title: str) -> list[int] | None:
-    """Places of the columns x, y and z in a line of titles; None if it does not name each once."""
+    """Return the columns x, y and z in a line of titles; None unless it names each once."""
     words = [word.lower() for word in _words(title)]
     for ends in (("x", "y", "z"), ("points:0", "points:1", "points:2")):
         for pattern in ("{}", "(.*[^a-z])?{}"):

@@ -1,11 +1,11 @@
 """From a vademecum and a cloud to loads and rigid motion: iterated closest points.
 
-With x' = c + R (x + u(x) - c) + t for the organ's surface, each point of the cloud is at a signed
-distance from the surface as it lies now; its derivatives by the displacement and by R and t are
-those of its foot along the normal there (point to plane; Chen & Medioni, Image and Vision Computing
-10, 1992). A Gauss-Newton step is the mean of the linearised posterior
-(:mod:`avatar_core.registration.posterior`); points weigh as Student's distribution has it, so that
-some strays do no harm. Smooth loads begin with steps that move the organ rigidly alone; the places
+The organ's surface moves to x' = c + R (x + u(x) - c) + t. Each point of the cloud has a signed
+distance from the present surface. Its derivatives by the displacement and by R and t are those of
+its foot along the normal there (point to plane; Chen & Medioni, Image and Vision Computing 10,
+1992). A Gauss-Newton step is the mean of the linearised posterior
+(:mod:`avatar_core.registration.posterior`). Points are weighted by Student's distribution, so that
+some strays do no harm. Smooth loads begin with steps that move the organ rigidly alone. The places
 of a few forces (:mod:`avatar_core.registration.sites`) are sought anew in each step.
 """
 
@@ -109,9 +109,9 @@ class RegistrationRule:
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """Another answer that explains the cloud about as well.
+    """Another solution that explains the cloud about as well.
 
-    weight : by its likelihood, of all answers together at most 1
+    weight : weight by its likelihood, at most 1 for all solutions together
     displacement, place : ndarray, shape (n_vertices, 3) [m]
     """
 
@@ -122,18 +122,19 @@ class Alternative:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The end of the iteration.
+    """Result of the iteration.
 
-    kind : of the loads
-    loads : LoadBasis; motion : RigidMotion
+    kind : kind of the loads
+    loads : LoadBasis
+    motion : RigidMotion
     coefficients : ndarray, shape (n,), of the loads
     covariance : ndarray, shape (n + 6, n + 6), of coefficients, turn and shift
     residuals : ndarray, signed distances of the points that were used [m]
-    outlying : part of the points that the robust weights hold for strays
+    outlying : fraction of the points with robust weights of strays
     scales : ndarray, (traction [Pa] or displacement [m], length [m], noise [m], mismatch [m])
-    alternatives : of the place of the strongest force; empty for smooth loads
+    alternatives : other places of the strongest force; empty for smooth loads
     prior_deviation : ndarray, shape (n_vertices,) [m], of a place before the cloud is seen
-    n_steps, converged : of the iteration
+    n_steps, converged : number of steps, and whether the iteration converged
     """
 
     kind: Kind
@@ -162,7 +163,7 @@ _LEAST_SPREAD = 1e-7  # prior deviation of a turn [rad] and a shift [m] that are
 
 
 def fit(problem: Problem, kind: Kind) -> Fit:
-    """Loads of a kind and rigid motion that bring the organ's surface to a cloud.
+    """Return loads of a kind and a rigid motion that bring the organ's surface to a cloud.
 
     Raises
     ------
@@ -221,9 +222,9 @@ def fit(problem: Problem, kind: Kind) -> Fit:
 def rigid_motion(
     vademecum: Vademecum, cloud: Cloud, rule: RegistrationRule | None = None
 ) -> RigidMotion:
-    """Rigid motion from the organ to a cloud, by the rigid steps alone.
+    """Return the rigid motion from the organ to a cloud, by the rigid steps alone.
 
-    Arguments and errors as of :func:`avatar_core.registration.register.register`.
+    For arguments and errors see :func:`avatar_core.registration.register.register`.
     """
     rule = rule or RegistrationRule()
     problem = Problem(vademecum, cloud.thinned(), rule)
@@ -232,20 +233,20 @@ def rigid_motion(
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where the organ is: displacement of the vertices (n, 3) [m], turn and shift (6,)."""
+    """Position of the organ: displacement of the vertices (n, 3) [m], turn and shift (6,)."""
 
     displacement: FloatArray
     rigid: FloatArray
 
     def towards(self, other: State, part: float) -> State:
-        """A part of the way to another state."""
+        """Return a state part of the way to another one."""
         return State(
             self.displacement + part * (other.displacement - self.displacement),
             self.rigid + part * (other.rigid - self.rigid),
         )
 
     def far_from(self, other: State, problem: Problem) -> float:
-        """Largest move of a point of the surface between two states [m]."""
+        """Return the largest move of a surface point between two states [m]."""
         change = problem.surface(other) - problem.surface(self)
         return float(np.sqrt((change**2).sum(axis=1).max()))
 
@@ -255,9 +256,11 @@ class Seen:
     """The cloud at a state: derivatives of distances, and their weights.
 
     by_surface : sparse, shape (n_points, 3 n_surface), by the displacement of the surface
-    by_motion : ndarray, shape (n_points, 6); distance : shape (n_points,) [m]
+    by_motion : ndarray, shape (n_points, 6)
+    distance : ndarray, shape (n_points,) [m]
     data : distances that the organ at rest would have, in the linearisation [m]
-    weights : robust, shape (n_points,); cells : sparse, (n_cells, n_points)
+    weights : ndarray, shape (n_points,), robust
+    cells : sparse, shape (n_cells, n_points)
     """
 
     by_surface: sp.csr_matrix
@@ -269,7 +272,7 @@ class Seen:
 
 
 class Problem:
-    """What the steps work on: the organ's surface at rest, the cloud, and the kinds of loads."""
+    """Problem of the steps: the organ's surface at rest, the cloud, and the kinds of loads."""
 
     def __init__(self, vademecum: Vademecum, points: FloatArray, rule: RegistrationRule) -> None:
         mesh = vademecum.mesh
@@ -284,13 +287,13 @@ class Problem:
         self._kinds: dict[str, LoadBasis | PointForces] = {}
 
     def with_points(self, points: FloatArray) -> Problem:
-        """The same organ and loads for other points."""
+        """Return the same organ and loads for other points."""
         other = Problem(self.vademecum, points, self.rule)
         other._kinds = self._kinds
         return other
 
     def with_field(self, loads: LoadBasis) -> Problem:
-        """The same with other loads in place of the smooth ones."""
+        """Return the problem with other loads in place of the smooth ones."""
         other = self.with_points(self.points)
         other._kinds = {"smooth": loads}
         return other
@@ -306,7 +309,7 @@ class Problem:
         return allowed_at(self.vademecum.surface, self.rule.forces, at_rest.back(self.points))
 
     def field(self, kind: Kind) -> LoadBasis:
-        """Tractions all over where forces may act."""
+        """Return tractions wherever forces may act."""
         if kind not in self._kinds:
             smooth = smooth_loads(self.vademecum, self.allowed, kind == "pressure")
             self._kinds[kind] = smooth.beside(self.supports) if self.supports else smooth
@@ -327,7 +330,7 @@ class Problem:
         return found
 
     def forces_at(self, chosen: list[int]) -> LoadBasis:
-        """A few forces, beside motions of the supports."""
+        """Return a few forces, beside motions of the supports."""
         forces = self.point_forces.basis(chosen)
         return forces.beside(self.supports) if self.supports else forces
 
@@ -343,7 +346,7 @@ class Problem:
     # --- states -------------------------------------------------------------------------------
 
     def start(self, rigid_steps: int) -> State:
-        """The organ at rest after some rigid steps."""
+        """Return the organ at rest after some rigid steps."""
         at = State(np.zeros_like(self.vademecum.mesh.vertices), np.zeros(6))
         scales = np.exp(self.rule.scales("smooth", self.young_modulus).middle)
         none = LoadBasis(np.zeros((1, 3, 0)), np.zeros((*at.displacement.shape, 0)), _no_loads)
@@ -356,20 +359,20 @@ class Problem:
         return at
 
     def state(self, loads: LoadBasis, unknowns: FloatArray) -> State:
-        """Where coefficients, turn and shift bring the organ."""
+        """Return the state by coefficients, turn and shift."""
         n = loads.size
         return State(loads.displacement(unknowns[:n]), unknowns[n:])
 
     def motion(self, at: State) -> RigidMotion:
-        """The rigid part of a state."""
+        """Return the rigid part of a state."""
         return RigidMotion(self.centre).with_unknowns(at.rigid)
 
     def surface(self, at: State) -> FloatArray:
-        """The organ's surface, shape (n_surface, 3) [m]."""
+        """Return the organ's surface, shape (n_surface, 3) [m]."""
         return self.motion(at)(self.vertices + at.displacement[self.on_surface])
 
     def place(self, at: State) -> FloatArray:
-        """All vertices in the cloud's frame, shape (n_vertices, 3) [m]."""
+        """Return all vertices in the cloud's frame, shape (n_vertices, 3) [m]."""
         return self.motion(at)(self.vademecum.mesh.vertices + at.displacement)
 
     @property
@@ -379,13 +382,13 @@ class Problem:
         return np.maximum(each, _LEAST_SPREAD)
 
     def spread_of(self, loads: LoadBasis) -> Spread:
-        """Prior standard deviations of all unknowns, as a function of the scales."""
+        """Return prior standard deviations of all unknowns, as a function of the scales."""
         return lambda scales: np.concatenate(
             [loads.spread(float(scales[0]), float(scales[1])), self.rigid_spread]
         )
 
     def prior_deviation(self, kind: Kind, loads: LoadBasis, scales: FloatArray) -> FloatArray:
-        """Root mean square of a place before the cloud is seen, over the axes, (n_vertices,)."""
+        """Return the prior root mean square of a place, over the axes, (n_vertices,)."""
         if kind == "few":
             places = self.point_forces
             columns = places.columns * (scales[0] * places.per_metre)[None, None, :, None]
@@ -400,7 +403,7 @@ class Problem:
     # --- equations ----------------------------------------------------------------------------
 
     def linearised(self, at: State, scales: FloatArray, first: bool = False) -> Seen:
-        """The cloud at a state; the first times with the noise that the distances show."""
+        """Return the cloud at a state; at first with the noise that the distances show."""
         surface, motion = self.surface(at), self.motion(at)
         feet, face, where = closest_points(surface, self.faces, self.points)
         corners = self.faces[face]
@@ -430,13 +433,13 @@ class Problem:
         )
 
     def equations(self, seen: Seen, loads: LoadBasis) -> Equations:
-        """The equations of a cloud for coefficients, turn and shift."""
+        """Return the equations of a cloud for coefficients, turn and shift."""
         columns = loads.columns[self.on_surface].reshape(3 * len(self.on_surface), loads.size)
         rows = np.hstack([seen.by_surface @ columns, seen.by_motion])
         return equations(rows, seen.data, seen.weights, seen.cells)
 
     def sites(self, seen: Seen, scales: FloatArray) -> Found:
-        """Places of a few forces, likeliest first."""
+        """Return places of a few forces, likeliest first."""
         places = self.point_forces
         columns = places.columns[self.on_surface].reshape(3 * len(self.on_surface), -1)
         size = np.repeat(scales[0] * places.per_metre, 3).astype(np.float32)
@@ -449,13 +452,13 @@ class Problem:
         return find_sites(common, rows.reshape(len(rows), -1, 3), seen.data, error)
 
     def widened(self, scales: FloatArray, seen: Seen) -> FloatArray:
-        """The scales with noise and mismatch as large as the distances are."""
+        """Return the scales with noise and mismatch as large as the distances are."""
         off = 1.4826 * float(np.median(np.abs(seen.distance)))
         larger = max(1.0, off / float(np.hypot(scales[2], scales[3])))
         return np.asarray(scales * [1.0, 1.0, larger, larger])
 
     def alternatives(self, seen: Seen, found: Found, scales: FloatArray) -> tuple[Alternative, ...]:
-        """Other places of the strongest force, by how likely they make the cloud."""
+        """Return other places of the strongest force, by their likelihood for the cloud."""
         order = np.argsort(-found.gain)[:_MOST_ALTERNATIVES]
         weight = np.exp(found.gain[order] - found.gain[order[0]])
         kept = weight > _LEAST_WEIGHT

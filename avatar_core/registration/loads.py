@@ -1,15 +1,15 @@
 """Loads that may have deformed an organ, in few coefficients, and the displacement they cause.
 
-Three kinds. ``smooth``: the traction is a Gaussian field of the length l and the standard deviation
-s. In eigenfunctions of the surface's Laplacian, -div grad phi_i = lambda_i phi_i, its coefficients
-are independent, with variances (Solin & Sarkka, Statistics and Computing 30, 2020)
+There are three kinds. ``smooth``: the traction is a Gaussian field of the length l and the standard
+deviation s. In eigenfunctions of the surface's Laplacian, -div grad phi_i = lambda_i phi_i, its
+coefficients are independent. Their variances (Solin & Sarkka, Statistics and Computing 30, 2020)
 
-    s^2 2 pi l^2 exp(-l^2 lambda_i / 2),
+    s^2 2 pi l^2 exp(-l^2 lambda_i / 2)
 
-so that l and s change a diagonal and nothing else. ``pressure``: the same along the normals alone.
-``few``: forces at a few places, as tools and retractors make them; at each, a vector whose standard
-deviation would displace the organ there by the scale s [m]. Beside smooth loads the organ's weight
-may have turned: a uniform body force, of which the vademecum holds the sag.
+depend on l and s by a diagonal alone. ``pressure``: the same along the normals alone. ``few``:
+forces at a few places, e.g. of tools and retractors. Each is a vector whose standard deviation
+would displace the organ there by the scale s [m]. Beside smooth loads the organ's weight may have
+turned: a uniform body force, whose sag the vademecum holds.
 """
 
 from __future__ import annotations
@@ -40,16 +40,17 @@ _BATCH = 300  # columns computed at once
 
 @dataclass(frozen=True, eq=False)
 class LoadBasis:
-    """Coefficients of loads, the forces that they stand for, and what they displace.
+    """Coefficients of loads, the forces that they stand for, and their displacement.
 
     Attributes
     ----------
     forces : ndarray, shape (n_positions, 3, n)
-        Forces at each load position [N] by each coefficient.
+        Forces at each load position by each coefficient [N].
     columns : ndarray, shape (n_vertices, 3, n)
-        Columns [m], displacement by each coefficient.
+        Displacement by each coefficient [m].
     spread : Callable[[float, float], ndarray]
-        Prior standard deviations of the coefficients (n,) at a scale and a length [m].
+        Function that returns prior standard deviations of the coefficients (n,) at a scale and a
+        length [m].
     """
 
     forces: FloatArray
@@ -62,7 +63,7 @@ class LoadBasis:
         return self.columns.shape[2]
 
     def beside(self, other: LoadBasis) -> LoadBasis:
-        """These loads and others together."""
+        """Return these loads and others together."""
 
         def spread(scale: float, length: float) -> FloatArray:
             return np.concatenate([self.spread(scale, length), other.spread(scale, length)])
@@ -89,7 +90,13 @@ def smooth_loads(
 
     Parameters
     ----------
-    allowed : ndarray of bool, shape (n_positions,), where loads may act
+    vademecum : Vademecum
+    allowed : ndarray of bool, shape (n_positions,)
+        Mask of positions where loads may act.
+    along_normals : bool
+        Whether tractions act along the normals alone.
+    n : int
+        Number of functions.
     """
     surface = vademecum.surface
     eigenvalues, functions, area = _eigenfunctions(surface, n)
@@ -125,11 +132,11 @@ class PointForces:
     positions : ndarray of int, shape (n,)
         Load positions.
     columns : ndarray, shape (n_vertices, 3, n, 3)
-        Columns [m/N], by a force at each place.
+        Displacement by a force at each place [m/N].
     per_metre : ndarray, shape (n,)
         Force that displaces the organ there by a unit [N/m].
     n_positions : int
-        n positions of the vademecum.
+        Number of load positions of the vademecum.
     """
 
     positions: IntArray
@@ -139,7 +146,7 @@ class PointForces:
 
     @classmethod
     def of(cls, vademecum: Vademecum, allowed: FloatArray) -> PointForces:
-        """At most ``MOST_SITES``, far from one another.
+        """Return at most ``MOST_SITES`` places, far from one another.
 
         allowed : ndarray of bool, shape (n_positions,), where loads may act
         """
@@ -165,7 +172,7 @@ class PointForces:
 
 
 def displaced_by(vademecum: Vademecum, positions: IntArray, forces: FloatArray) -> FloatArray:
-    """Displacement of all vertices by forces (n, 3, m) at some positions, (n_vertices, 3, m)."""
+    """Return the displacement by forces (n, 3, m) at some positions, (n_vertices, 3, m)."""
     n_vertices, m = len(vademecum.mesh.vertices), forces.shape[2]
     out = np.empty((n_vertices, 3, m), np.float32)
     for first in range(0, m, _BATCH):
@@ -181,11 +188,10 @@ def displaced_by(vademecum: Vademecum, positions: IntArray, forces: FloatArray) 
 
 
 def moved_supports(vademecum: Vademecum, shift: float) -> LoadBasis:
-    """Springs whose other ends move rigidly, six unknowns each: packing, a diaphragm that rises.
+    """Return springs whose other ends move rigidly, six unknowns each: packing, a rising diaphragm.
 
-    On a support the traction is k (d - u), so that a motion d of its other end loads the organ by
-    k int d . v da; its response is solved for by finite elements. The clamp alone moves as the
-    frame does.
+    On a support the traction is k (d - u). A motion d of its other end therefore loads the organ by
+    k int d . v da; finite elements solve for the response. The clamp alone moves with the frame.
 
     shift : prior root mean square of a shift [m]; a turn moves the rim of a support as far
     """
@@ -222,13 +228,16 @@ def moved_supports(vademecum: Vademecum, shift: float) -> LoadBasis:
 
 
 def allowed_at(surface: LoadSurface, forces: str, points: FloatArray | None = None) -> FloatArray:
-    """Load positions where forces may act, ndarray of bool, shape (n_positions,).
+    """Return the load positions where forces may act, ndarray of bool, shape (n_positions,).
 
     Parameters
     ----------
-    forces : "accessible", all of them; "seen", those within reach of ``points``; or
-        "near X Y Z RADIUS", those in a ball [m]
-    points : ndarray, shape (n, 3) [m], a cloud in the organ's frame at rest
+    surface : LoadSurface
+    forces : str
+        "accessible", all positions; "seen", positions within reach of ``points``; or "near X Y Z
+        RADIUS", positions in a ball [m].
+    points : ndarray, shape (n, 3)
+        A cloud in the organ's frame at rest [m].
 
     Raises
     ------
@@ -270,7 +279,10 @@ def _unknown(forces: str) -> RegistrationError:
 
 
 def _eigenfunctions(surface: LoadSurface, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """lambda (n,) [1/m^2], phi (n_positions, n) with int phi^2 da = 1, area of each position."""
+    """Return lambda (n,) [1/m^2], phi (n_positions, n), and each position's area.
+
+    int phi^2 da = 1.
+    """
     vertices = np.ascontiguousarray(surface.centers, float)
     faces = np.ascontiguousarray(_triangles(surface), np.int64)
     area = igl.massmatrix(vertices, faces, igl.MASSMATRIX_TYPE_BARYCENTRIC).diagonal()

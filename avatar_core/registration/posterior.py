@@ -1,12 +1,12 @@
-"""What a linearised cloud says of unknowns with a Gaussian prior, and of the prior itself.
+"""Posterior of unknowns with a Gaussian prior, from a linearised cloud, and the prior's scales.
 
     d = J z + e,   z ~ N(0, S^2),   e ~ N(0, sigma^2 / W + tau^2 C)
 
-J are the derivatives of the distances from the surface, W the robust weights of the points, and
-C is one for points of a common cell, as large as a triangle of the mesh, and zero for others: tau
-is how far the organ's true surface is off the mesh. The scales of prior and noise are those that
-make the cloud most likely (MacKay, Neural Computation 4, 1992), and their own uncertainty is taken
-along by the points of an unscented transform (Julier & Uhlmann, Proc. IEEE 92, 2004).
+J are the derivatives of the distances from the surface, W the robust weights of the points. C is
+one for points of a common cell, as large as a triangle of the mesh, and zero for others: tau is the
+distance of the organ's true surface from the mesh. The scales of prior and noise are those that
+make the cloud most likely (MacKay, Neural Computation 4, 1992). Their own uncertainty is included
+by the points of an unscented transform (Julier & Uhlmann, Proc. IEEE 92, 2004).
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ class Equations:
     ----------
     gram : ndarray, shape (n, n)
         J^T W J.
-    right : ndarray
-        (n,), J^T W d.
+    right : ndarray, shape (n,)
+        J^T W d.
     square : float
         d^T W d.
-    cell_rows : ndarray, shape (n_cells, n)
-        Sums of W J over cells; cell_right, cell_weight likewise of W d and W.
-    n_points, log_weights : int
+    cell_rows, cell_right, cell_weight : ndarray, shape (n_cells, n), (n_cells,), (n_cells,)
+        Sums of W J, W d and W over cells.
+    n_points, log_weights : int, float
         Number of points, sum of log W.
     """
 
@@ -95,10 +95,10 @@ def cells_of(points: FloatArray, size: float) -> sp.csr_matrix:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Of the unknowns at given scales: their mean (n,), and the factor of I + S H S.
+    """Posterior at given scales: mean (n,) of the unknowns, and the factor of I + S H S.
 
-    The covariance is S (I + S H S)^-1 S; ``cost`` is minus the log of the marginal likelihood,
-    but for a constant.
+    The covariance is S (I + S H S)^-1 S; ``cost`` is minus the log of the marginal likelihood, up
+    to a constant.
     """
 
     mean: FloatArray
@@ -108,7 +108,7 @@ class Posterior:
 
     @property
     def covariance(self) -> FloatArray:
-        """Shape (n, n)."""
+        """Covariance of the unknowns, shape (n, n)."""
         half = solve_triangular(self.factor, np.diag(self.spread), lower=True, check_finite=False)
         return np.asarray(half.T @ half)
 
@@ -118,7 +118,12 @@ def posterior(found: Equations, spread: FloatArray, noise: float, mismatch: floa
 
     Parameters
     ----------
-    noise : sigma [m]; mismatch : tau [m]
+    found : Equations
+    spread : ndarray, shape (n,)
+    noise : float
+        sigma [m].
+    mismatch : float
+        tau [m].
     """
     inverse = noise**-2
     taken = inverse**2 / (mismatch**-2 + inverse * found.cell_weight)  # Woodbury, cell by cell
@@ -160,7 +165,7 @@ def likeliest(
 def averaged(
     found: Equations, spread: Spread, prior: Scales, best: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean (n,) and covariance (n, n) of the unknowns, over scales that are as likely as they are.
+    """Return mean (n,) and covariance (n, n) of the unknowns, averaged over likely scales.
 
     best : logarithms of the likeliest scales
     """
@@ -184,7 +189,7 @@ def _cost(found: Equations, spread: Spread, prior: Scales) -> Callable[[FloatArr
 
 
 def _root(cost: Callable[[FloatArray], float], best: FloatArray) -> FloatArray:
-    """A square root of the covariance of the scales' logarithms: inverse curvature of the cost."""
+    """Return a root of the covariance of the scales' logarithms: inverse curvature of the cost."""
     n = len(best)
     step = _STEP * np.eye(n)
     here = cost(best)

@@ -1,4 +1,4 @@
-"""The organ where a cloud shows it: displacement everywhere, with what is not known of it."""
+"""Registration of an organ to a cloud: displacement everywhere, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -42,20 +42,20 @@ _INSIDE = 5e-3  # of a target from the organ at most [m]
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Where a point of the organ, or the middle of some, has gone.
+    """Present place of a point of the organ, or of the middle of some vertices.
 
     Attributes
     ----------
     name : str
-        What it is.
+        Name of the point.
     rest, place : ndarray, shape (3,)
-        Rest and place [m], before, and now in the cloud's frame.
+        Place at rest, and present place in the cloud's frame [m].
     displacement : ndarray, shape (3,)
-        Displacement [m], by deformation, along the axes at rest.
-    displacement_deviation, place_deviation : ndarray
-        Standard deviations along the axes, (3,) [m].
+        Displacement by deformation, along the axes at rest [m].
+    displacement_deviation, place_deviation : ndarray, shape (3,)
+        Standard deviations along the axes [m].
     model_error : float
-        Standard deviation of each from the vademecum's own error [m], part of both.
+        Standard deviation of each from the vademecum's own error, part of both [m].
     """
 
     name: str
@@ -332,12 +332,12 @@ def _beside(spread: FloatArray, column: FloatArray) -> FloatArray:
 
 
 def cloud_part(points: FloatArray) -> FloatArray:
-    """Some 500 points of a cloud, by which distances to it are judged."""
+    """Return some 500 points of a cloud, by which distances to it are judged."""
     return points[:: max(1, len(points) // 500)]
 
 
 def _roots(vademecum: Vademecum, found: Fit) -> FloatArray:
-    """Return R with R R^T ~ the covariance, shape (n + 6, k): what moves the surface alone."""
+    """Return R with R R^T ~ the covariance, shape (n + 6, k), for what moves the surface alone."""
     size = np.sqrt(np.maximum(np.diagonal(found.covariance), np.finfo(float).tiny))
     value, vector = np.linalg.eigh(found.covariance / np.outer(size, size))  # alike in unit
     half = size[:, None] * vector * np.sqrt(np.maximum(value, 0.0))
@@ -353,7 +353,7 @@ def _roots(vademecum: Vademecum, found: Fit) -> FloatArray:
 
 
 def _problems(found: Fit, rule: RegistrationRule, strain: float) -> tuple[str, ...]:
-    """Why loads, rigid motion and noise do not explain the cloud."""
+    """Return reasons why loads, rigid motion and noise do not explain the cloud."""
     noise, mismatch = found.scales[2], found.scales[3]
     problems = []
     if not found.converged:

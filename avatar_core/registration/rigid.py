@@ -21,7 +21,7 @@ class RigidMotion:
     turn : ndarray, shape (3,)
         Rotation vector [rad].
     shift : ndarray, shape (3,)
-        Shift [m].
+        Translation [m].
     """
 
     centre: FloatArray
@@ -30,7 +30,7 @@ class RigidMotion:
 
     @property
     def matrix(self) -> FloatArray:
-        """R, shape (3, 3)."""
+        """Rotation matrix R, shape (3, 3)."""
         return np.asarray(Rotation.from_rotvec(self.turn).as_matrix())
 
     @property
@@ -48,13 +48,13 @@ class RigidMotion:
         return np.asarray(self.centre + (points - self.shift - self.centre) @ self.matrix)
 
     def with_unknowns(self, unknowns: FloatArray) -> RigidMotion:
-        """Return the another motion about the same centre."""
+        """Return another motion about the same centre."""
         return RigidMotion(self.centre, unknowns[:3], unknowns[3:])
 
     def rows(self, points: FloatArray, normals: FloatArray) -> FloatArray:
         """Return the derivatives of moved points along normals by the unknowns, shape (n, 6).
 
-        To first order in the change of the turn, which is taken for one about the same axis.
+        They are exact to first order in a change of the turn about the same axis.
         """
         arms = points - self.centre - self.shift
         return np.hstack([np.cross(arms, normals), normals])

@@ -1,14 +1,14 @@
-"""Where a few forces act: places sought one after another, by how likely they make the cloud.
+"""Places of a few forces, sought one after another, by the likelihood of the cloud.
 
-With the equations d = J z + e of :mod:`avatar_core.registration.posterior` and the unknowns z of
-rigid motion and of places already chosen, a force at one more place has the marginal likelihood
+Take the equations d = J z + e of :mod:`avatar_core.registration.posterior`, with the unknowns z of
+rigid motion and of places already chosen. A force at one more place has the marginal likelihood
 
     log p = 1/2 r^T M^-1 r - 1/2 log det M,   M = I + S H S - X^T G^-1 X,
 
-with its own block H of J^T E^-1 J, the coupling X to the others, and r what they leave: a system of
-three unknowns for each place, solved for all at once. A place is added while that makes the cloud
-likelier than without it in the mean over all places (orthogonal matching pursuit; Tropp & Gilbert,
-IEEE Trans. Inf. Theory 53, 2007, with a Bayesian stop).
+with its own block H of J^T E^-1 J, the coupling X to the others, and r the residual of the others.
+This is a system of three unknowns for each place, solved for all at once. A place is added while it
+makes the cloud likelier on average over all places than without it (orthogonal matching pursuit;
+Tropp & Gilbert, IEEE Trans. Inf. Theory 53, 2007, with a Bayesian stop).
 """
 
 from __future__ import annotations
@@ -31,10 +31,9 @@ class Noise:
     Attributes
     ----------
     weights : ndarray, shape (n_points,)
-    cells : sp.csr_matrix
-        Sparse, (n_cells, n_points).
+    cells : sparse, shape (n_cells, n_points)
     noise, mismatch : float
-        Sigma, tau [m].
+        sigma, tau [m].
     """
 
     weights: FloatArray
@@ -43,7 +42,7 @@ class Noise:
     mismatch: float
 
     def weighed(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Two arrays (A, B) with J^T E^-1 J' = A^T A' - B^T B' of rows J, J' (n_points, n)."""
+        """Return (A, B) with J^T E^-1 J' = A^T A' - B^T B' for rows J, J' (n_points, n)."""
         inverse = self.noise**-2
         taken = inverse**2 / (self.mismatch**-2 + inverse * (self.cells @ self.weights))
         own = np.sqrt(inverse * self.weights)[:, None] * rows
@@ -53,8 +52,11 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """chosen : places, the likeliest first; gain : ndarray, shape (n_places,), log likelihood of
-    a force at each place in that of the first, given the others.
+    """Places of forces, and the likelihood of others.
+
+    chosen : places, the likeliest first
+    gain : ndarray, shape (n_places,), log likelihood of a force at each place instead of the first,
+        given the others
     """
 
     chosen: list[int]
@@ -68,9 +70,15 @@ def find_sites(
 
     Parameters
     ----------
-    common : ndarray, shape (n_points, m), rows of the rigid motion times prior deviations
-    rows : ndarray, shape (n_points, n_places, 3), of a force at each place, likewise
-    data : ndarray, shape (n_points,) [m]
+    common : ndarray, shape (n_points, m)
+        Rows of the rigid motion times prior deviations.
+    rows : ndarray, shape (n_points, n_places, 3)
+        Rows of a force at each place, times prior deviations.
+    data : ndarray, shape (n_points,)
+        Distances [m].
+    error : Noise
+    most : int
+        Largest number of forces.
     """
     n_points, n_places, _ = rows.shape
     own, shared = error.weighed(rows.reshape(n_points, -1).astype(np.float32))
@@ -96,7 +104,7 @@ def find_sites(
 
 @dataclass(frozen=True, eq=False)
 class _Weighed:
-    """Sums over the points that do not depend on what was chosen."""
+    """Sums over the points that do not depend on the chosen places."""
 
     own: FloatArray
     shared: FloatArray

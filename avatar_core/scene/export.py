@@ -1,4 +1,4 @@
-"""A vademecum for ParaView: the organ at rest, its modes, and how a load deforms it."""
+"""Export of a vademecum for ParaView: the organ at rest, its modes, and its motion under a load."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ def organ_mesh(
 ) -> meshio.Mesh:
     """Return the mesh at rest [m] with point data.
 
-    "displacement [m]" (n_vertices, 3) under a force, by :meth:`Vademecum.displacement_at`;
-    mode_001 and so on, (n_vertices, 3), as in the file; clamped, accessible (n_vertices,), 1 on
-    these parts of the surface
+    The data are "displacement [m]" (n_vertices, 3) under a force, by
+    :meth:`Vademecum.displacement_at`; mode_001 and so on, (n_vertices, 3); and clamped, accessible
+    (n_vertices,), 1 on these parts.
     """
     mesh, far = vademecum.mesh, vademecum.far
     data = {DISPLACEMENT: vademecum.displacement_at(point, force)}

@@ -43,7 +43,7 @@ SECTIONS = {
     "material": ("young_modulus", "poisson_ratio", "supports", "resection"),
     "outputs": ("cloud", "cloud_divisor", "modes"),
 }
-SHIPPED = "scenes"  # folder of those that come with the project
+SHIPPED = "scenes"  # folder of the shipped scenes
 _KEYS = ("name", "text", "organ", "material", "tools", "outputs", "effects")
 
 
@@ -53,12 +53,12 @@ def shipped_scenes() -> dict[str, Path]:
 
 
 def shipped_scene(name: str) -> Path:
-    """Return the file of a scene that comes with the project, by name, with or without ``.yaml``.
+    """Return the file of a shipped scene, by name, with or without ``.yaml``.
 
     Raises
     ------
     SceneError
-        If there is no such scene, or the name is a path; lists the scenes there are.
+        If there is no scene of that name, or the name is a path; lists the shipped scenes.
     """
     known = shipped_scenes()
     if (stem := name.removesuffix(".yaml")) not in known:
@@ -72,7 +72,7 @@ def shipped_scene(name: str) -> Path:
 def scene_path(name: str) -> Path:
     """Return the file of a scene: a path, or the name of a shipped scene.
 
-    Raises SceneError as :func:`shipped_scene`, for a name without folder and suffix.
+    Raises SceneError like :func:`shipped_scene`, for a name without folder and suffix.
     """
     path = Path(name)
     is_path = path.is_file() or path.name != name or bool(path.suffix)
@@ -93,14 +93,14 @@ def parse_scene(text: str, source: str, folder: Path | None = None) -> Scene:
     text : str
         YAML.
     source : str
-        Its name in error messages.
+        Name of the text in error messages.
     folder : Path or None
-        Folder in which files that it names must lie; None if it may name none.
+        Folder in which files that the text names must lie; None if it may name no file.
 
     Raises
     ------
     SceneError
-        In one line: source, line number, key, value, and what is allowed.
+        In one line: source, line number, key, value, and allowed values.
     """
     root = compose(text, source)
     entries = entries_of(root, "", _KEYS)
@@ -187,7 +187,7 @@ def _supports(node: Node, path: str) -> tuple[SupportStiffness, ...]:
 
 
 def _number(node: Node, path: str, allowed: Any, whole: bool) -> float:
-    """A number, also one such as 20e-3, which is text in YAML 1.1; in quotes, it is refused."""
+    """Return a number; unquoted text like 20e-3, which YAML 1.1 reads as text, is accepted."""
     value = math.nan
     is_number = isinstance(node, ScalarNode) and node.style is None
     try:
@@ -242,7 +242,7 @@ def _tool(node: Node, path: str, known: Sequence[str]) -> Tool:
 
 
 def _part(kind: type, node: Node, path: str, **given: Any) -> Any:
-    """Return a tip or a jaw: its numbers, and what is given beside them."""
+    """Return a tip or a jaw from its numbers and further given values."""
     known = [field.name for field in fields(kind) if field.name not in ("grasp", *given)]
     values = _fields(kind, entries_of(node, path, known), path)
     with placed_at(node):

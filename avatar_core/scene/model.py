@@ -61,7 +61,7 @@ class Tool:
 
 @dataclass(frozen=True)
 class SupportStiffness:
-    """How firmly a support holds the organ, if that is a coordinate of the vademecum.
+    """Stiffness of a support, if that is a coordinate of the vademecum.
 
     Raises
     ------
@@ -247,9 +247,9 @@ def _figure(certificate: Any, key: str | None) -> float | None:
 
 
 def _require_coordinate(vademecum: Vademecum, key: str, name: str, value: float) -> None:
-    """Refuse a value of a coordinate that the vademecum has not, or out of its range.
+    """Refuse a value of a coordinate that the vademecum does not have, or out of its range.
 
-    The range of a support is that at the vademecum's Young's modulus; ``Vademecum.at`` checks
+    The range of a support is the range at the vademecum's Young's modulus; ``Vademecum.at`` checks
     others.
     """
     coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()

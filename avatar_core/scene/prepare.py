@@ -1,4 +1,4 @@
-"""From a vademecum and a scene to a contact model, as exact as a budget allows.
+"""Preparation of a contact model from a vademecum and a scene, as exact as a budget allows.
 
 ``vademecum, scene -> scene_spec -> ModelSpec -> layout -> ContactModel``
 """
@@ -20,7 +20,7 @@ from avatar_core.vademecum.model import Vademecum
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """What a scene makes of a vademecum.
+    """Specification of a contact model: a vademecum adapted to a scene.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class ModelSpec:
     tips : tuple[Tip, ...]
         Tips of the tools.
     modes : int or None
-        Modes of the displacement at most; None for all.
+        Largest number of modes of the displacement; None for all.
     """
 
     vademecum: Vademecum
@@ -40,17 +40,20 @@ class ModelSpec:
 
     @property
     def finest(self) -> Detail:
-        """All modes, or as many as were asked for."""
+        """Detail with all modes, or as many as were asked for."""
         return Detail(self.modes or self.vademecum.n_modes, self.cloud)
 
     @property
     def effect_names(self) -> tuple[str, ...]:
-        """Of the effects, in their order."""
+        """Names of the effects, in their order."""
         return tuple(effect.name for effect in self.effects)
 
     @property
     def curve(self) -> AccuracyCurve | None:
-        """All details of this cloud up to the finest; None if their errors were not measured."""
+        """Curve of this cloud's details up to the finest.
+
+        None if their errors were not measured.
+        """
         certificate = self.vademecum.certificate
         curve = certificate.curve if certificate else None
         return curve and curve.of(self.cloud).up_to(self.finest.modes)
@@ -67,7 +70,7 @@ def default_spec(
     cloud: Cloud = "surface",
     values: Mapping[str, float] | None = None,
 ) -> ModelSpec:
-    """Without a scene: the default effects of the vademecum and the number of tools.
+    """Return the specification without a scene: default effects and the number of tools.
 
     Parameters
     ----------
@@ -81,17 +84,19 @@ def default_spec(
 def scene_spec(
     vademecum: Vademecum, scene: Scene, values: Mapping[str, float] | None = None
 ) -> ModelSpec:
-    """What a scene makes of a vademecum.
+    """Return the specification of a scene with a vademecum.
 
     Parameters
     ----------
+    vademecum : Vademecum
+    scene : Scene
     values : Mapping[str, float] or None
         Values of the material, by coordinate; they override those of the scene.
 
     Raises
     ------
     AvatarError
-        What the vademecum cannot serve, with the remedy.
+        If the vademecum does not support the scene, with the remedy.
     """
     given = dict(values or {})
     if "contrast" in given:

@@ -36,7 +36,7 @@ def parse_prony(text: str, source: str) -> dict[str, tuple[float, ...]]:
 
 
 def _is_header(cells: list[str]) -> bool:
-    """Return the units may follow the two words, as in ``g [-], tau [s]``."""
+    """Return whether cells are the header; units may follow the words, e.g. ``g [-], tau [s]``."""
     return [cell.partition(" ")[0].lower() for cell in cells] == ["g", "tau"]
 
 

@@ -1,8 +1,8 @@
 """Recordings of a tool and of the forces on it, on disk: HDF5 with schema version and checksum.
 
-Layout (schema 2.0), attributes at the root: ``format`` = "avatar recording", ``schema``,
-``vademecum_id``, ``vademecum_name``, ``scene`` (YAML, with the material that was in force),
-``rate`` [Hz], ``from_rest``, ``checksum``. Datasets, n periods of the contact loop, t tools:
+Layout (schema 2.0). Attributes at the root: ``format`` = "avatar recording", ``schema``,
+``vademecum_id``, ``vademecum_name``, ``scene`` (YAML, with the material in force), ``rate`` [Hz],
+``from_rest``, ``checksum``. Datasets, for n periods of the contact loop and t tools:
 
     periods/number (n,)          counted by the loop; gaps are lost periods
     periods/stamp (n,) [ns]      time stamp of the first tool's pose
@@ -46,7 +46,7 @@ _TEXTS = ("format", "schema", "vademecum_id", "vademecum_name", "scene", "rate",
 
 @dataclass(frozen=True, eq=False)
 class Periods:
-    """What the contact loop did, one entry per period; shapes as in the file."""
+    """Record of the contact loop, one entry per period; shapes as in the file."""
 
     number: np.ndarray
     stamp: np.ndarray

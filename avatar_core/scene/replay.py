@@ -1,14 +1,14 @@
 """Replay of a recording: the same tool path through the same step, and a comparison of the forces.
 
-The force in a period depends on the tips in it and on the state of the model: whether a tip entered
-through the surface, the previous force, anchors of friction, relaxation, modal velocities, phase of
-the breath. A period is *known* if this state follows from the recording:
+The force in a period depends on the tips in it and on the state of the model. The state is whether
+a tip entered through the surface, the previous force, anchors of friction, relaxation, modal
+velocities, and phase of the breath. A period is *known* if this state follows from the recording:
 
-- without effects, or with friction, large deformation, self-weight, several tools and tilt, the
-  state is reset whenever no tip touches: known from the first such period on, and again after lost
-  periods;
-- with viscoelasticity or inertia, only in a recording from rest, up to the first lost period;
-- with respiration never: the phase of the breath is not recorded.
+- Without effects, or with friction, large deformation, self-weight, several tools and tilt, the
+  state is reset whenever no tip touches. It is known from the first such period on, and again after
+  lost periods.
+- With viscoelasticity or inertia, only in a recording from rest, up to the first lost period.
+- With respiration never: the phase of the breath is not recorded.
 
 Forces in known periods are identical to the last bit on the machine that recorded them. They are
 compared before the force guard, whose state (limits, ramps, engagement) is not recorded.
@@ -45,14 +45,14 @@ class Replayed:
     force : ndarray, shape (n, n_tools, 3)
         Force [N].
     known : ndarray of bool, shape (n,)
-        Known where they must equal the recorded ones.
+        Whether the force must equal the recorded one.
     """
 
     force: np.ndarray
     known: np.ndarray
 
     def difference(self, recording: Recording) -> float:
-        """Return largest difference of a force in known periods [N]; NaN if no period is known."""
+        """Return the largest force difference in known periods [N]; NaN if no period is known."""
         if not self.known.any():
             return float("nan")
         gap = self.force[self.known] - recording.periods.force[self.known]
@@ -66,8 +66,10 @@ def replay(
 
     Parameters
     ----------
+    recording : Recording
+    vademecum : Vademecum
     progress : Callable[[int, int], None] or None
-        Called with the periods that are computed, and how many there are.
+        Called with the number of computed periods, and of all.
 
     Raises
     ------
@@ -102,7 +104,7 @@ def replay(
 
 
 def scene_of(recording: Recording) -> Scene:
-    """The scene in a recording, which nobody can correct: what is wrong with it, is recorded."""
+    """Return the scene in a recording, without checks: its errors are recorded facts."""
     try:
         return parse_scene(recording.scene, "scene of the recording")
     except SceneError as error:
@@ -113,7 +115,7 @@ def scene_of(recording: Recording) -> Scene:
 
 
 def known_periods(periods: Periods, scene: Scene, from_rest: bool) -> np.ndarray:
-    """Whether the state of the model in each period follows from the recording, shape (n,)."""
+    """Return whether each period's model state follows from the recording, shape (n,)."""
     names = {effect.name for effect in scene.effects}
     known = np.zeros(len(periods), bool)
     if names & set(_RECORDED_NOWHERE):
@@ -129,7 +131,7 @@ def known_periods(periods: Periods, scene: Scene, from_rest: bool) -> np.ndarray
 
 
 def why_not(recording: Recording) -> str:
-    """Why no period of a recording is known, and the remedy."""
+    """Return the reason why no period of a recording is known, and the remedy."""
     names = {effect.name for effect in parse_scene(recording.scene, "scene").effects}
     for name, what in _RECORDED_NOWHERE.items():
         if name in names:

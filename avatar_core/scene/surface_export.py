@@ -1,7 +1,8 @@
 """Deformed surfaces for 3D Slicer: STL, OBJ and VTP in millimetres, which state their axes.
 
-Slicer takes coordinates as LPS (left, posterior, superior) unless a file says ``SPACE=RAS``, and so
-does :func:`avatar_core.geometry.surface.read_surface`: what is written comes back to its place.
+Slicer takes coordinates as LPS (left, posterior, superior) unless a file says ``SPACE=RAS``.
+:func:`avatar_core.geometry.surface.read_surface` does the same: a written surface comes back to its
+place.
 """
 
 from __future__ import annotations
@@ -36,19 +37,21 @@ def write_surfaces(
 
     Parameters
     ----------
+    vademecum : Vademecum
     path : str or Path
-        .stl, .obj or .vtp, of the organ.
+        File of the organ, .stl, .obj or .vtp.
     points : ndarray, shape (n, 3)
-        Displayed vertices where they are now [m]; see :func:`displaced`.
+        Present places of the displayed vertices [m]; see :func:`displaced`.
     unit, axes : str
-        Unit and axes of what is written.
+        Unit and axes of the files.
     fields : Fields or None
-        Values at displayed vertices, shape (n,), or vectors along RAS, (n, 3); .vtp alone holds
-        them, vectors along its own axes.
+        Values at displayed vertices, shape (n,), or vectors along RAS, (n, 3). Only .vtp holds
+        them, with vectors along its own axes.
 
     Returns
     -------
-    Vertices, in ``unit`` and ``axes``, and faces of each file.
+    dict[Path, tuple[ndarray, ndarray]]
+        Vertices, in ``unit`` and ``axes``, and faces of each file.
 
     Raises
     ------
@@ -85,7 +88,7 @@ def displaced(vademecum: Vademecum, displacement: np.ndarray) -> np.ndarray:
 
 
 def carried(vademecum: Vademecum, values: np.ndarray) -> np.ndarray:
-    """Return the values at vertices of the mesh, (n_vertices, ...), taken to the displayed ones."""
+    """Return values at mesh vertices, (n_vertices, ...), interpolated at the displayed ones."""
     display = vademecum.display
     if display is None:
         return np.asarray(values[vademecum.mesh.surface_vertices])
@@ -93,7 +96,7 @@ def carried(vademecum: Vademecum, values: np.ndarray) -> np.ndarray:
 
 
 def _plain(name: str) -> str:
-    """Return a name without letters that files must not have."""
+    """Return a name without letters that are forbidden in file names."""
     return "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in name)
 
 
@@ -121,7 +124,7 @@ def _write_obj(
 def _write_vtp(
     path: Path, vertices: np.ndarray, faces: np.ndarray, axes: str, fields: Fields
 ) -> None:
-    """VTK's XML as text, with the field in which 3D Slicer states the axes."""
+    """Write VTK's XML as text, with the field in which 3D Slicer states the axes."""
     places = "\n".join(f"{x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices)
     corners = "\n".join(f"{a} {b} {c}" for a, b, c in faces)
     ends = " ".join(str(3 * k) for k in range(1, len(faces) + 1))

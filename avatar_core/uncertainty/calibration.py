@@ -62,7 +62,7 @@ _FARTHEST = 4.0  # deviations from what was known, of the values that are tried
 _UNKNOWN = 0.1  # error of a force whose place was never certified
 _LEAST_TOUCHES = 3
 _STEP, _FLAT = 0.05, 1e-6  # of a standard normal number; least d ln p / dz
-_TAIL = 4.0  # degrees of freedom of a vademecum's error over what it states
+_TAIL = 4.0  # degrees of freedom of a vademecum's error over the stated one
 
 
 @dataclass(frozen=True)
@@ -96,16 +96,17 @@ class TouchTable:
 
     Attributes
     ----------
+    grid : MaterialGrid
     palpation : Palpation
-        Palpation of which the touches are that the vademecum feels.
+        Touches that meet the organ in the vademecum.
     left_out : int
-        Number of touches that it does not feel.
+        Number of touches that miss it.
     log_force : ndarray, shape (n_points, n_samples)
-        Ln of the force [N].
+        Logarithm of the force [N].
     steepness : ndarray, shape (n_samples,)
         d ln F / d depth [1/m].
     error : ndarray, shape (n_samples,)
-        Standard deviation of the vademecum's own error, a part of the force.
+        Standard deviation of the vademecum's own error, relative to the force.
     """
 
     grid: MaterialGrid
@@ -116,22 +117,25 @@ class TouchTable:
     error: FloatArray
 
     def at(self, values: Mapping[str, FloatArray]) -> FloatArray:
-        """ln of the forces at values of all coordinates and "young", each (n,): (n, n_samples)."""
+        """Return ln of the forces at values of all coordinates and "young".
+
+        Each value has the shape (n,); the result (n, n_samples).
+        """
         softer = np.log(self.grid.softer(values))
         return np.asarray(self.grid.weights(values) @ self.log_force + softer[:, None])
 
     @property
     def measured(self) -> FloatArray:
-        """Return ln of the measured forces, shape (n_samples,)."""
+        """Logarithm of the measured forces, shape (n_samples,)."""
         return np.asarray(np.log(self.palpation.force[self.palpation.sampled]))
 
     @property
     def touch(self) -> np.ndarray:
-        """The touch of each sample, shape (n_samples,)."""
+        """Number of each sample's touch, shape (n_samples,)."""
         return np.asarray(self.palpation.touch[self.palpation.sampled])
 
     def where(self, kept: np.ndarray) -> TouchTable:
-        """Of some touches only, (n_touches,) of bool."""
+        """Return the table of some touches only, a mask (n_touches,)."""
         samples = kept[self.touch]
         return replace(
             self,
@@ -144,12 +148,15 @@ class TouchTable:
     def covariance(
         self, errors: TouchErrors, log_force: FloatArray, inflated: FloatArray | None = None
     ) -> FloatArray:
-        """Return C at forces that are expected, shape (n_samples, n_samples).
+        """Return C at expected forces, shape (n_samples, n_samples).
 
         Parameters
         ----------
-        inflated : ndarray or None
-            (n_touches,) factor on the variance of the vademecum's own error at each touch.
+        errors : TouchErrors
+        log_force : ndarray, shape (n_samples,)
+            Logarithm of the expected forces.
+        inflated : ndarray or None, shape (n_touches,)
+            Factor on the variance of the vademecum's own error at each touch.
         """
         same = (self.touch[:, None] == self.touch).astype(float)
         moved, own = errors.depth * self.steepness, self.error
@@ -277,7 +284,7 @@ def touch_table(
     Raises
     ------
     ContactError
-        If the vademecum feels too few of the touches.
+        If too few of the touches meet the organ in the vademecum.
     """
     grid, force = MaterialGrid.of(vademecum), []
     error = np.zeros(len(palpation.tip))
@@ -294,7 +301,7 @@ def touch_table(
 def _of_felt(
     grid: MaterialGrid, palpation: Palpation, force: FloatArray, error: FloatArray
 ) -> TouchTable:
-    """Return the table of the touches whose samples are all felt."""
+    """Return the table of the touches whose samples all have a force."""
     silent = palpation.sampled & ~(force > 0.0).all(axis=0)
     felt = np.bincount(palpation.touch, silent, palpation.n_touches) == 0
     if felt.sum() < _LEAST_TOUCHES:
@@ -320,7 +327,7 @@ def _of_felt(
 
 
 def _followed(model: ContactModel, palpation: Palpation) -> tuple[FloatArray, FloatArray]:
-    """Force along the paths [N], and its error as a part of it, each (n,)."""
+    """Return the force along the paths [N], and its relative error, each (n,)."""
     data = model.data()
     force, error = np.zeros((2, len(palpation.tip)))
     before = -1
@@ -359,9 +366,10 @@ def calibrated(
 
     Parameters
     ----------
+    table : TouchTable
     known : Mapping[str, Distribution]
-        Known of every coordinate and "young", as :func:`avatar_core.uncertainty.known.known_of`
-        gives.
+        Prior of every coordinate and "young", see :func:`avatar_core.uncertainty.known.known_of`.
+    errors : TouchErrors or None
     """
     names = tuple(name for name, one in known.items() if not isinstance(one, Fixed))
     errors = errors or TouchErrors()
@@ -405,8 +413,9 @@ def calibrated(
 def _extents(
     known: Mapping[str, Distribution], names: tuple[str, ...], at: FloatArray, errors: TouchErrors
 ) -> FloatArray:
-    """Variances of the standard normal numbers by ``errors.extent``, shape (n,), no larger than
-    before anything was known.
+    """Return variances of the standard normal numbers by ``errors.extent``, shape (n,).
+
+    They are no larger than the prior variances.
     """
     found = np.zeros(len(names))
     for k, name in enumerate(names):
@@ -418,15 +427,16 @@ def _extents(
 
 
 def _places(palpation: Palpation) -> FloatArray:
-    """Where each touch was deepest, shape (n_touches, 3) [m]."""
+    """Return the deepest place of each touch, shape (n_touches, 3) [m]."""
     last = np.searchsorted(palpation.touch, np.arange(palpation.n_touches), side="right") - 1
     return palpation.tip[last]
 
 
 def _together(touch: np.ndarray, covariance: FloatArray) -> FloatArray:
-    """From misfits of samples to one for each touch, over its deviation, (n_touches, n_samples).
+    """Return weights that make one misfit per touch from samples, over its deviation.
 
-    The weights are those of least variance within a touch, C^-1 1 / sqrt(1^T C^-1 1).
+    Shape (n_touches, n_samples). The weights are those of least variance within a touch, C^-1 1 /
+    sqrt(1^T C^-1 1).
     """
     out = np.zeros((touch[-1] + 1, len(touch)))
     for k, row in enumerate(out):

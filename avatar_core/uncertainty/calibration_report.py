@@ -1,4 +1,4 @@
-"""A calibration as lines of text, as numbers, as distributions in a file and as a picture."""
+"""Report of a calibration: lines of text, numbers, distributions in a file and a picture."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _WORST = 3  # touches that are named where the fit is bad
 
 
 def say(name: str, table: TouchTable, found: Calibration) -> None:
-    """Print what was known before, what is known now, and whether the model fits."""
+    """Print prior and posterior, and whether the model fits."""
     force = np.exp(table.measured)
     left = f"; {table.left_out} more do not meet the organ" if table.left_out else ""
     print(
@@ -99,7 +99,7 @@ def _correlation(found: Calibration) -> np.ndarray:
 
 
 def distributions_text(name: str, found: Calibration) -> str:
-    """The posterior as `avatar uncertainty FILE --given` and the contact node read it, YAML."""
+    """Return the posterior as YAML, for `avatar uncertainty FILE --given` and the contact node."""
     told: dict[str, Any] = {}
     for parameter in found.known:
         one = found.posterior(parameter)
@@ -111,7 +111,7 @@ def distributions_text(name: str, found: Calibration) -> str:
 
 
 def picture(file: Path, name: str, table: TouchTable, found: Calibration) -> None:
-    """Measured over computed forces, and each parameter before and after."""
+    """Draw measured over computed forces, and each parameter before and after."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -138,7 +138,7 @@ def _draw_forces(axes: Axes, table: TouchTable, found: Calibration) -> None:
 
 
 def _draw_parameters(axes: Axes, found: Calibration) -> None:
-    """Each parameter over its most probable value, on a scale of factors."""
+    """Draw each parameter over its most probable value, on a scale of factors."""
     for k, name in enumerate(found.names):
         middle = found.value(name)
         before = [float(found.known[name].ppf(np.array(p))) / middle for p in (0.05, 0.95)]

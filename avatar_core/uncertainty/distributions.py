@@ -1,7 +1,7 @@
-"""What is known of a parameter: a fixed value, a range, or a median with a factor.
+"""Distributions of a parameter: a fixed value, a range, or a median with a factor.
 
-A vademecum is exact to some per cent about a problem whose data are not. A distribution says of
-each of its coordinates, and of Young's modulus, what is known.
+A vademecum is exact to some per cent for a problem whose data are less certain. A distribution
+states the knowledge of one coordinate, or of Young's modulus.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from avatar_core.errors import CoordinateError
 
 LEAST_INSIDE = 0.9  # of a distribution's probability that a vademecum's range must hold
 MAX_BYTES = 16_000  # of a file of distributions
-SHIPPED = "uncertainty"  # folder of those that come with the project
+SHIPPED = "uncertainty"  # folder of the shipped distributions
 
 
 class Distribution(Protocol):
@@ -35,7 +35,7 @@ class Distribution(Protocol):
         """Return the probability that the parameter lies below a value."""
 
     def said(self, unit: str = "") -> str:
-        """What is known, in words, with a unit."""
+        """Return the distribution in words, with a unit."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,15 @@ class Fixed:
     value: float
 
     def ppf(self, probability: FloatArray) -> FloatArray:
+        """Return the quantiles at some probabilities (0 to 1)."""
         return np.full(np.shape(probability), self.value)
 
     def cdf(self, value: float) -> float:
+        """Return the probability that the parameter lies below a value."""
         return float(value >= self.value)
 
     def said(self, unit: str = "") -> str:
+        """Return the distribution in words, with a unit."""
         return f"{self.value:g}{unit}"
 
 
@@ -66,12 +69,15 @@ class Uniform:
             raise CoordinateError(f"uniform:{self.low:g}:{self.high:g} is empty; give LOW < HIGH")
 
     def ppf(self, probability: FloatArray) -> FloatArray:
+        """Return the quantiles at some probabilities (0 to 1)."""
         return self.low + (self.high - self.low) * np.asarray(probability)
 
     def cdf(self, value: float) -> float:
+        """Return the probability that the parameter lies below a value."""
         return min(max((value - self.low) / (self.high - self.low), 0.0), 1.0)
 
     def said(self, unit: str = "") -> str:
+        """Return the distribution in words, with a unit."""
         return f"{self.low:g} to {self.high:g}{unit}, all alike"
 
 
@@ -89,14 +95,17 @@ class LogUniform:
             )
 
     def ppf(self, probability: FloatArray) -> FloatArray:
+        """Return the quantiles at some probabilities (0 to 1)."""
         return np.asarray(self.low * (self.high / self.low) ** np.asarray(probability))
 
     def cdf(self, value: float) -> float:
+        """Return the probability that the parameter lies below a value."""
         if value <= self.low:
             return 0.0
         return min(math.log(value / self.low) / math.log(self.high / self.low), 1.0)
 
     def said(self, unit: str = "") -> str:
+        """Return the distribution in words, with a unit."""
         return f"{self.low:g} to {self.high:g}{unit}, every factor alike"
 
 
@@ -116,23 +125,26 @@ class Lognormal:
 
     def ppf(self, probability: FloatArray) -> FloatArray:
         # Here, because the contact node needs none of it.
+        """Return the quantiles at some probabilities (0 to 1)."""
         from scipy.special import ndtri
 
         return np.asarray(self.median * self.factor ** ndtri(probability))
 
     def cdf(self, value: float) -> float:
+        """Return the probability that the parameter lies below a value."""
         if value <= 0.0:
             return 0.0
         deviations = math.log(value / self.median) / math.log(self.factor)
         return 0.5 * math.erfc(-deviations / math.sqrt(2.0))
 
     def said(self, unit: str = "") -> str:
+        """Return the distribution in words, with a unit."""
         return f"{self.median:g}{unit}, give or take a factor of {self.factor:g}"
 
 
 @dataclass(frozen=True)
 class Within:
-    """A distribution that is cut off at the ends of a range, and fills it."""
+    """A distribution that is cut off at the ends of a range and renormalised."""
 
     whole: Distribution
     low: float
@@ -140,20 +152,23 @@ class Within:
 
     @property
     def inside(self) -> float:
-        """Part of the whole distribution within the range, ends included."""
+        """Fraction of the whole distribution within the range, ends included."""
         below = self.whole.cdf(np.nextafter(self.low, -np.inf))
         return self.whole.cdf(self.high) - below
 
     def ppf(self, probability: FloatArray) -> FloatArray:
+        """Return the quantiles at some probabilities (0 to 1)."""
         first, last = self.whole.cdf(self.low), self.whole.cdf(self.high)
         drawn = self.whole.ppf(first + (last - first) * np.asarray(probability))
         return np.clip(drawn, self.low, self.high)
 
     def cdf(self, value: float) -> float:
+        """Return the probability that the parameter lies below a value."""
         first, last = self.whole.cdf(self.low), self.whole.cdf(self.high)
         return min(max((self.whole.cdf(value) - first) / (last - first), 0.0), 1.0)
 
     def said(self, unit: str = "") -> str:
+        """Return the distribution in words, with a unit."""
         return self.whole.said(unit)
 
 
@@ -168,7 +183,7 @@ _EXAMPLE = "write young=lognormal:5e3:1.5, poisson=uniform:0.4:0.49 or contrast=
 
 
 def parse(text: str) -> tuple[str, Distribution]:
-    """Return ``NAME=KIND:NUMBERS``, as on the command line."""
+    """Parse ``NAME=KIND:NUMBERS`` from the command line, e.g. `young=lognormal:5300:1.33`."""
     name, _, told = text.partition("=")
     kind, *numbers = told.split(":")
     try:
@@ -181,7 +196,7 @@ def parse(text: str) -> tuple[str, Distribution]:
 
 
 def within(name: str, whole: Distribution, low: float, high: float) -> Distribution:
-    """Return a distribution over the range that a vademecum holds.
+    """Return a distribution cut off at the range that a vademecum holds.
 
     Raises
     ------
@@ -201,12 +216,12 @@ _WRITTEN = "write young: {lognormal: {median: 5.0e+3, factor: 1.5}}"
 
 
 def distribution_file(value: str) -> Path:
-    """The file that a text names: a path if it has a /, else one that comes with the project.
+    """Return the file that a text names: a path if it has a /, else a shipped file.
 
     Raises
     ------
     CoordinateError
-        If none of that name comes with it; lists those that do.
+        If no shipped file has that name; lists the shipped files.
     """
     if "/" in value:
         return Path(value).expanduser().absolute()
@@ -239,18 +254,18 @@ def read_distributions(file: Path) -> dict[str, Distribution]:
 
 
 def of_mappings(told: Mapping[Any, Any], origin: str) -> dict[str, Distribution]:
-    """Return the distributions by name of the parameter, of what a file of them consists of.
+    """Return distributions by parameter, from a file's mappings.
 
     Raises
     ------
     CoordinateError
-        For what is no distribution, naming ``origin`` and the parameter.
+        For a value that is no distribution; names ``origin`` and the parameter.
     """
     return {str(name): _of_mapping(origin, name, one) for name, one in told.items()}
 
 
 def mappings(known: Mapping[str, Distribution]) -> dict[str, dict[str, Any]]:
-    """Return the inverse of :func:`of_mappings`, of distributions that are not cut off."""
+    """Return mappings for a file, the inverse of :func:`of_mappings`; not for cut distributions."""
     found = {}
     for name, one in known.items():
         kind = next(kind for kind, made in _KINDS.items() if isinstance(one, made))

@@ -1,18 +1,18 @@
-"""Whether a model can have made the forces of some touches: what it leaves must be chance.
+"""Check whether a model can have made the forces of some touches: the misfit must be chance.
 
 The misfit of a touch over its standard deviation, d, is taken for Student's t; its normal score is
 
     s = Phi^-1(T(d)).
 
-If model and errors are as stated, scores are independent standard normal numbers, but for what the
-parameters fitted away. Two tests look for what is not.
+If model and errors are as stated, scores are independent standard normal numbers, reduced only by
+the fitted parameters. Two tests look for deviations.
 
 Large. The sum of all s^2 is chi-square distributed. It finds errors that are larger than stated,
 anywhere.
 
-Local. What a model lacks inside, such as a tumour, makes all touches around it deviate to one side,
-by less the farther they are: as g_t = exp(-|x_t - c|^2 / L^2). Of that, parameters imitate a part:
-with G the derivatives of the deviations by the parameters, h = g - G (G^T G)^-1 G^T g is left. The
+Local. A missing structure inside, e.g. a tumour, makes all touches around it deviate to one side,
+by less the farther they are: as g_t = exp(-|x_t - c|^2 / L^2). Parameters imitate a part of this.
+With G the derivatives of the deviations by the parameters, h = g - G (G^T G)^-1 G^T g remains. The
 largest h . s / |h| over places c and reaches L is compared with that of drawn scores (a scan
 statistic; Kulldorff, Communications in Statistics 26:1481, 1997).
 """
@@ -34,14 +34,18 @@ _IMITATED = 0.1  # |h| over |g|, below which the parameters make up for all
 def chance(
     deviations: FloatArray, places: FloatArray, derivatives: FloatArray, freedom: float
 ) -> float:
-    """Return probability that a fit is as bad as this by chance, by the test that it passes worse.
+    """Return the probability that a fit is as bad by chance, from the worse of both tests.
 
     Parameters
     ----------
-    deviations : ndarray, shape (n,), d of each touch
-    places : ndarray, shape (n, 3) [m]
-    derivatives : ndarray, shape (n, n_parameters), G
-    freedom : degrees of freedom of Student's t
+    deviations : ndarray, shape (n,)
+        d of each touch.
+    places : ndarray, shape (n, 3)
+        Places of the touches [m].
+    derivatives : ndarray, shape (n, n_parameters)
+        G.
+    freedom : float
+        Degrees of freedom of Student's t.
     """
     scores = normal_scores(deviations, freedom)
     n_left = max(len(scores) - derivatives.shape[1], 1)
@@ -56,7 +60,7 @@ def normal_scores(deviations: FloatArray, freedom: float) -> FloatArray:
 
 
 def local_chance(scores: FloatArray, places: FloatArray, derivatives: FloatArray) -> float:
-    """Return the probability that drawn scores deviate as much around a place as these, (n,)."""
+    """Return the probability that drawn scores (n,) deviate as much around a place as these."""
     shapes = _shapes(places, derivatives)
     if len(shapes) == 0:
         return 1.0

@@ -1,17 +1,17 @@
-"""How far the edges of a force's band lie from the force, for every load position and some depths.
+"""Ratios of the edges of a force's band to the force, by load position and depth.
 
-A tip d deep that feels the force F on tissue of the modulus E* sinks, with L = F / (s E*), by
+A tip d deep has the force F on tissue of the modulus E*. With L = F / (s E*), it sinks by
 
     d = delta(L) + L s E* (gamma - c)
 
-(:mod:`avatar_core.tips.law`); a patch by gamma F. The shape factor s knows the
-surface alone: the material comes in by E* and gamma, the compliance of a load position with itself.
-For both, no vademecum has to be made at every point of the coordinates. So F is found at
-Chebyshev's points of those that are not known, interpolated as in
-:mod:`avatar_core.uncertainty.material_grid`, drawn, and its quantiles are taken.
+(:mod:`avatar_core.tips.law`); a patch by gamma F. The shape factor s depends on the surface alone.
+The material enters by E* and gamma, the compliance of a load position with itself. Neither needs a
+vademecum at every point of the coordinates. F is therefore computed at Chebyshev's points of the
+uncertain coordinates and interpolated like in :mod:`avatar_core.uncertainty.material_grid`. Its
+quantiles are those of draws.
 
-It takes tissue to be linear and at rest without the tool: forces are then proportional to Young's
-modulus. Beside self-weight and other tools, whose own depths stay as they are, that is nearly so.
+Tissue is taken to be linear and at rest without the tool: forces are then proportional to Young's
+modulus. With self-weight and other tools, whose own depths do not change, that is nearly so.
 """
 
 from __future__ import annotations
@@ -59,9 +59,12 @@ def log_edges(
     Parameters
     ----------
     vademecum : Vademecum
-        Vademecum at whatever values.
+        Vademecum at any values.
+    tips : Sequence[Tip]
     known : Mapping[str, Distribution]
-        Known of all its parameters, by :func:`avatar_core.uncertainty.known.known_of`.
+        Distributions of all its parameters, by :func:`avatar_core.uncertainty.known.known_of`.
+    draws, seed : int
+        Number of draws, and their seed.
 
     Returns
     -------
@@ -88,16 +91,18 @@ def log_edges(
 def force_spread_at(
     vademecum: Vademecum, tip: Tip, known: Mapping[str, Distribution], points: np.ndarray
 ) -> FloatArray:
-    """Return the half of the band that holds 90 % of the force, over its middle, shape (n,).
+    """Return half the width of the band that holds 90 % of the force, over its middle, (n,).
 
         (F_95 - F_5) / (F_95 + F_5)
 
-    of a tip ``DEPTHS[1]`` deep, by :func:`log_edges`; NaN off the accessible surface.
+    for a tip ``DEPTHS[1]`` deep, by :func:`log_edges`; NaN off the accessible surface.
 
     Parameters
     ----------
+    vademecum : Vademecum
+    tip : Tip
     known : Mapping[str, Distribution]
-        Known of all parameters of the vademecum, by :func:`avatar_core.uncertainty.known.known_of`.
+        Distributions of all its parameters, by :func:`avatar_core.uncertainty.known.known_of`.
     points : ndarray, shape (n, 3)
         Points of the surface at rest [m].
     """
@@ -108,7 +113,7 @@ def force_spread_at(
 
 
 def log_forces(vademecum: Vademecum, tips: Sequence[Tip]) -> FloatArray:
-    """ln of the forces at the values that a vademecum has, (n_tips, n_positions, n_depths)."""
+    """Return ln of the forces at a vademecum's values, (n_tips, n_positions, n_depths)."""
     compliance = own_compliance(vademecum)
     shapes, v = _shape_factors(vademecum, tips), vademecum
     return _log_forces(v, tips, shapes, compliance, v.material, v.contrast)
@@ -121,7 +126,7 @@ def _at(
     values: Mapping[str, float],
     young: float,
 ) -> FloatArray:
-    """Return the same at values of all coordinates, and a Young's modulus [Pa]."""
+    """Return the same logarithms at values of all coordinates, and a Young's modulus [Pa]."""
     poisson = values.get("poisson", vademecum.material.poisson_ratio)
     compliance = own_compliance_at(vademecum, values)
     material = Material(young_modulus=young, poisson_ratio=poisson)
@@ -132,8 +137,10 @@ def _at(
 def _constant(
     coordinate: Coordinate, known: Mapping[str, Distribution], young: float
 ) -> float | None:
-    """The value of a coordinate that is known, at the Young's modulus of the points [Pa]; None if
-    it varies. The stiffness of a support varies with Young's modulus, over which it counts.
+    """Return a coordinate's known value at the Young's modulus of the points [Pa], or None.
+
+    None means that it varies. The stiffness of a support counts over Young's modulus, and varies
+    with it.
     """
     one, modulus = known[coordinate.name], known["young"]
     if not isinstance(one, Fixed):
@@ -146,7 +153,7 @@ def _constant(
 
 
 def _n_points(n_coordinates: int) -> int:
-    """Of Chebyshev for each coordinate."""
+    """Return the number of Chebyshev's points for each coordinate."""
     return min(N_POINTS, max(3, int(MAX_POINTS ** (1.0 / max(n_coordinates, 1)) + 1e-9)))
 
 
@@ -173,7 +180,10 @@ def _pressed(
     material: Material,
     contrast: float | None,
 ) -> FloatArray:
-    """Return forces on a tip at ``DEPTHS``, (n_positions, n_depths) [N]; gamma is that of E too."""
+    """Return forces on a tip at ``DEPTHS``, (n_positions, n_depths) [N].
+
+    gamma : compliances at the same Young's modulus
+    """
     law = _law(tip)
     if law is None:
         return np.asarray(DEPTHS / gamma[:, None])
@@ -191,7 +201,7 @@ def _pressed(
 
 
 def _law(tip: Tip) -> tuple[ArrayTable, ArrayTable] | None:
-    """Return the law of an upright tip, as the model and the data of no organ; None of a patch."""
+    """Return the law of an upright tip, as model and data without an organ; None for a patch."""
     law = law_arrays((tip,), Material(), np.zeros((2, 0, 0, 0), np.float32))
     if law is None:
         return None
@@ -202,7 +212,7 @@ def _law(tip: Tip) -> tuple[ArrayTable, ArrayTable] | None:
 
 
 def _shape_factors(vademecum: Vademecum, tips: Sequence[Tip]) -> FloatArray:
-    """s where tips press each load position, at the middle of ``DEPTHS``, (n_tips, n_positions)."""
+    """Return s where tips press each load position, at the middle depth, (n_tips, n_positions)."""
     field, surface = vademecum.tip_field, vademecum.surface
     shape = factors_of(field, tips)
     found = np.empty((len(tips), surface.n_positions))

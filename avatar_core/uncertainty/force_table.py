@@ -1,9 +1,9 @@
-"""The force at some places and depths as a function of the material, from a few vademecums.
+"""Force at some places and depths as a function of the material, from a few vademecums.
 
     ln F(p) ~ sum_n l_n(p) ln F(p_n)
 
-over the points of :mod:`avatar_core.uncertainty.material_grid`; what the displacement elsewhere
-needs is interpolated alike.
+over the points of :mod:`avatar_core.uncertainty.material_grid`. The displacement elsewhere is
+interpolated alike.
 """
 
 from __future__ import annotations
@@ -48,13 +48,16 @@ class ForceTable:
     log_moved: FloatArray
 
     def force(self, values: Mapping[str, FloatArray]) -> FloatArray:
-        """At values of all coordinates and "young", each (n,): (n, n_places, n_depths) [N]."""
+        """Return the force at values of all coordinates and "young" [N].
+
+        Each value has the shape (n,); the result (n, n_places, n_depths).
+        """
         softer = np.log(self.grid.softer(values))
         found = np.tensordot(self.grid.weights(values), self.log_force, 1)
         return np.asarray(np.exp(found + softer[:, None, None]))
 
     def moved(self, values: Mapping[str, FloatArray]) -> FloatArray:
-        """Return displacement of the target at these values, of that shape [m]; it knows no E."""
+        """Return target's displacement at these values, of the same shape [m]; E has no effect."""
         return np.asarray(np.exp(np.tensordot(self.grid.weights(values), self.log_moved, 1)))
 
 
@@ -66,21 +69,25 @@ def force_table(
     target: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> ForceTable:
-    """Return the press at load positions, at every point of the coordinates.
+    """Press at load positions, at every point of the coordinates; return the table.
 
     Parameters
     ----------
+    vademecum : Vademecum
+    tip : Tip
     places : Sequence[int]
         Load positions.
     depths : Sequence[float]
-        Rising, of the tip below the surface [m].
+        Depths of the tip below the surface, rising [m].
     target : int
         Vertex whose displacement is asked for.
+    progress : Callable[[int, int], None]
+        Called with the number of finished materials, and of all.
 
     Raises
     ------
     ContactError
-        If a tip finds no surface at a place, or is not felt there.
+        If a tip finds no surface at a place, or has no force there.
     """
     grid, force, moved = MaterialGrid.of(vademecum), [], []
     shape = Shape.of(vademecum, (tip,))
@@ -127,7 +134,7 @@ def _pressed(
 
 
 def _motion(vademecum: Vademecum, places: Sequence[int], target: int) -> FloatArray:
-    """Displacement of a vertex by a unit force along the normal of each place, (n,) [m/N]."""
+    """Return a vertex's displacement by a unit normal force at each place, (n,) [m/N]."""
     normals, three = vademecum.surface.normals, slice(3 * target, 3 * target + 3)
     found = []
     for j in places:

@@ -1,5 +1,6 @@
-"""What is known of all parameters of a vademecum: what is given, for the rest its own values, or
-anything within its ranges.
+"""Distributions of all parameters of a vademecum, from those that are given.
+
+Other parameters take the vademecum's own values, or anything within its ranges.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class Held:
 
     @staticmethod
     def by(vademecum: Vademecum) -> Held:
-        """Those of a vademecum."""
+        """Return the parameters of a vademecum."""
         material, parametric = vademecum.material, vademecum.parametric
         coordinates = parametric.coordinates if parametric else ()
         own = {
@@ -64,18 +65,18 @@ class Held:
         )
 
     def plain(self) -> dict[str, Any]:
-        """As numbers and text, for a message."""
+        """Return the parameters as numbers and text, for a message."""
         return dict(plain(asdict(self)))
 
     @staticmethod
     def of_plain(stored: Mapping[str, Any]) -> Held:
-        """Return the inverse of :meth:`plain`."""
+        """Return the parameters from numbers and text, the inverse of :meth:`plain`."""
         return of_plain(Held, stored, "held")
 
     def known(self, given: Mapping[str, Distribution]) -> dict[str, Distribution]:
-        """A distribution of every coordinate and of "young", within what the vademecum holds.
+        """Return a distribution of every coordinate and of "young", within the vademecum's ranges.
 
-        What is not given has the vademecum's own value.
+        A parameter that is not given has the vademecum's own value.
 
         Raises
         ------
@@ -102,29 +103,29 @@ class Held:
         return found
 
     def scale(self, coordinate: Coordinate, young: Distribution) -> float:
-        """Of a coordinate's range: the stiffness of supports counts over Young's modulus."""
+        """Return the scale of a coordinate's range: supports count over Young's modulus."""
         if coordinate.kind != "support":
             return 1.0
         return float(young.ppf(np.array(0.5))) / self.reference
 
 
 def known_of(vademecum: Vademecum, given: Mapping[str, Distribution]) -> dict[str, Distribution]:
-    """Return :meth:`Held.known` of a vademecum."""
+    """Return the result of :meth:`Held.known` for a vademecum."""
     return Held.by(vademecum).known(given)
 
 
 def priors_of(
     vademecum: Vademecum, given: Mapping[str, Distribution] | None = None
 ) -> dict[str, Distribution]:
-    """Return a distribution of every coordinate and of "young": as given, or as wide as may be.
+    """Return a prior of every coordinate and of "young": as given, or as wide as possible.
 
-    A coordinate lies anywhere in its range; Young's modulus in ``YOUNG``, unless a support that is
-    no coordinate fixes it.
+    Without a given one, a coordinate lies anywhere in its range; Young's modulus in ``YOUNG``,
+    unless a support that is no coordinate fixes it.
 
     Raises
     ------
     CoordinateError
-        As :meth:`Held.known`.
+        See :meth:`Held.known`.
     """
     given, held = given or {}, Held.by(vademecum)
     own = Fixed(held.own["young"])

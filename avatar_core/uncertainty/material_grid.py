@@ -1,12 +1,12 @@
-"""What is a function of the material, from a few vademecums.
+"""Interpolation of a function of the material, from a few vademecums.
 
     f(p) ~ sum_n l_n(t(p)) f(p_n)
 
 with l_n the Lagrange polynomials on Chebyshev's points (of the first kind) of the coordinates'
 ranges, each in its own scale t, tensor-wise. The response is analytic in the coordinates, so that
 the error falls geometrically with the points (Trefethen, Approximation Theory, 2013). Young's
-modulus needs no point: forces at an imposed depth are proportional to it, with supports at the
-same stiffness over E,
+modulus needs no point: forces at an imposed depth are proportional to it, with supports at the same
+stiffness over E,
 
     F(E, k) = E / E0 F(E0, k E0 / E).
 """
@@ -34,11 +34,11 @@ class MaterialGrid:
     Attributes
     ----------
     coordinates : tuple[Coordinate, ...]
-        All of the vademecum, or some.
+        All coordinates of the vademecum, or some.
     young : float
         Young's modulus at the points, E0 [Pa].
     n_each : int
-        Points for each coordinate.
+        Number of points for each coordinate.
     """
 
     coordinates: tuple[Coordinate, ...]
@@ -79,7 +79,10 @@ class MaterialGrid:
         return np.asarray(values["young"]) / self.young
 
     def weights(self, values: Mapping[str, FloatArray]) -> FloatArray:
-        """Of the points, at values of all coordinates and "young", each (n,): (n, n_points)."""
+        """Return weights of the points at values of all coordinates and "young", (n, n_points).
+
+        Each value has the shape (n,).
+        """
         weights = np.ones((len(np.asarray(values["young"])), 1))
         for coordinate in self.coordinates:
             at = np.asarray(values[coordinate.name])
@@ -97,7 +100,7 @@ def chebyshev_points(n: int) -> FloatArray:
 
 
 def lagrange(fractions: Sequence[float], n: int) -> FloatArray:
-    """Weights of n of Chebyshev's points at some places of the range, shape (n_places, n)."""
+    """Return weights of n Chebyshev points at some places of the range, (n_places, n)."""
     nodes, at = chebyshev_points(n), np.asarray(fractions)[:, None]
     columns = []
     for k in range(n):

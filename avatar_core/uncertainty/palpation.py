@@ -1,8 +1,8 @@
-"""Touches of a tip with the forces that a sensor measured: what a calibration is made of.
+"""Touches of a tip with the forces that a sensor measured: the input of a calibration.
 
-A recording holds thousands of periods that say the same. Of each touch some samples are kept: on
+A recording holds thousands of periods that say the same. A few samples of each touch are kept: on
 its way to the largest force, where the force first reaches equal parts of it. The way back is left
-out, since tissue gives back less than it took.
+out, since tissue gives back less energy than it took.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ class Palpation:
     Attributes
     ----------
     tip : ndarray, shape (n, 3)
-        As a contact model takes it, each touch from outside of the organ to its largest force [m].
+        Positions of the tip for a contact model, each touch from outside the organ to its largest
+        force [m].
     touch : ndarray of int, shape (n,)
-        The number of the touch, ascending.
+        Number of the touch, ascending.
     force : ndarray, shape (n,)
         Measured size of the force [N]; NaN on the way between samples.
     """
@@ -50,7 +51,7 @@ class Palpation:
         return int(self.touch[-1]) + 1
 
     def where(self, kept: np.ndarray) -> Palpation:
-        """Only some touches, (n_touches,) of bool."""
+        """Return some touches only, a mask (n_touches,)."""
         chosen = kept[self.touch]
         _, touch = np.unique(self.touch[chosen], return_inverse=True)
         return Palpation(self.tip[chosen], touch, self.force[chosen])

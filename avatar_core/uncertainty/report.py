@@ -35,7 +35,7 @@ def rows(depths: Sequence[float], bands: Bands) -> list[dict[str, float | list[f
 def say(
     name: str, draws: int, known: Mapping[str, Distribution], depths: Sequence[float], bands: Bands
 ) -> None:
-    """Print what was assumed, and a line for each place and depth."""
+    """Print the assumptions, and a line for each place and depth."""
     print(f"{name}: {draws} draws")
     for parameter, one in known.items():
         print(f"  {parameter:10s} {one.said(UNITS.get(parameter, ''))}")
@@ -57,7 +57,7 @@ def say(
 def picture(
     file: Path, name: str, known: Mapping[str, Distribution], depths: Sequence[float], bands: Bands
 ) -> None:
-    """The bands over depth, and the shares at the largest depth."""
+    """Draw the bands over depth, and the variance fractions at the largest depth."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -35,7 +35,7 @@ _CLEAR = (
 )
 _LEAST_OFF = 5  # samples off the organ that tell the zero
 _MOST_LAG, _COARSE, _FINE = 0.4, 0.01, 0.003  # that is looked for, and the steps to it [s]
-_LEAST_LAG = 2e-3  # that is worth moving the forces [s]
+_LEAST_LAG = 2e-3  # lag below which forces are not shifted [s]
 _SAID = 0.01  # zero that is said [N]
 _PAUSE = 0.1  # for which a sample stands, at most [s]
 
@@ -110,7 +110,7 @@ def sensed(
 def _followed(
     vademecum: Vademecum, tip: Tip, position: FloatArray
 ) -> tuple[FloatArray, np.ndarray]:
-    """Force along a path at one material [N], and whether the tip is clearly off, each (n,)."""
+    """Return force along a path [N], and whether the tip is clearly off the organ, (n,) each."""
     here = next(iter(MaterialGrid.of(vademecum).materials(vademecum)))
     model = ContactModel(lay_out(here, (tip,), Detail(1, "off")))
     data = model.data()
@@ -124,7 +124,7 @@ def _followed(
 
 
 def _lag(time: FloatArray, size: FloatArray, expected: FloatArray) -> float:
-    """Return the time by which forces follow those expected [s]; negative where they run ahead."""
+    """Return the delay of forces against expected ones [s]; negative if forces run ahead."""
     weight = expected * np.minimum(np.gradient(time), _PAUSE)
 
     def overlap(lag: float) -> float:
@@ -140,7 +140,7 @@ def _lag(time: FloatArray, size: FloatArray, expected: FloatArray) -> float:
 
 
 def _lost(size: FloatArray, expected: FloatArray) -> float:
-    """Return the part of the work of the way in that the way out does not give back, 0 to 1."""
+    """Return the fraction of the inward work that the outward path does not return, 0 to 1."""
     known = np.isfinite(size)
     middle = 0.5 * (size[known][1:] + size[known][:-1])
     work = middle * np.diff(expected[known])
@@ -149,5 +149,5 @@ def _lost(size: FloatArray, expected: FloatArray) -> float:
 
 
 def _at(when: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:
-    """Values between their times; NaN before the first and after the last, and beside NaN."""
+    """Return values at times between given ones; NaN outside them and beside NaN."""
     return np.asarray(np.interp(when, time, values, np.nan, np.nan))
