@@ -1,5 +1,6 @@
-"""Experiments: those of the paper and ours, each with its rivals in the same run. Folders of livers
-come in; tables, JSON and pictures go out. Only the command imports this package.
+"""Experiments: those of the paper and ours, each with its rivals in the same run.
+
+Folders of livers come in; tables, JSON and pictures go out. Only the command imports this package.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Accuracy against time, online and offline, with rivals in the same run.
 
 Online: every level of detail of the displacement, timed on this machine, with errors on loads that
-neither the build nor the certificate used. Offline: size of the mesh.
-Also whether certified errors, budgets on other livers, and the estimated error of each force hold.
+neither the build nor the certificate used. Offline: size of the mesh. The study also checks
+certified errors, budgets on other livers, and the estimated error of each force.
 """
 
 from __future__ import annotations
@@ -51,8 +51,10 @@ FRESH = 1001  # seed of loads that no certificate draws
 
 @dataclass(frozen=True)
 class AccuracyTimeSettings:
-    """Numbers of vertices, of touches: certified, fresh and of the rivals; sizes of the meshes;
-    other livers on which budgets are tried, with so many touches each.
+    """Sizes of the study.
+
+    They are numbers of vertices and of touches (certified, fresh and for the rivals), sizes of the
+    meshes, and other livers on which budgets are tried, with their touches.
     """
 
     n_vertices: int = 2850
@@ -159,20 +161,20 @@ def _line(error: str, row: dict[str, Any], by: str) -> str:
 
 
 def _least_kept(rows: list[Row]) -> float:
-    """Return the least part of touches that keep a budget, over livers and budgets."""
+    """Return the least fraction of touches that keep a budget, over livers and budgets."""
     return min((float(row["kept"]) for row in rows if "kept" in row), default=float("nan"))  # type: ignore[arg-type]
 
 
 def _best(rows: list[Row]) -> dict[str, Any]:
-    """Return all modes, all vertices."""
+    """Return the row with all modes and all vertices."""
     found = [r for r in _of(rows, "vademecum") if r.get("cloud") == "volume"]
     return min(found, key=lambda r: r["error"])
 
 
 def _beside_table(rows: list[Row], vademecum: Vademecum) -> dict[str, float]:
-    """The best error in the dense table's time, all vertices shown, and the memory over its own.
+    """Return the best error in the dense table's time, all vertices shown, and the memory ratio.
 
-    Both hold what shows the displacement and what contact needs, without the tip field.
+    Both hold the data for display and contact, without the tip field.
     """
     volume = [row for row in rows if row.get("cloud") == "volume"]
     (table,) = _of(volume, "dense table")
@@ -221,14 +223,15 @@ def _online(rows: list[Row], cloud: str, axes: Axes) -> None:
 
 
 def _said(vademecum: Vademecum, fresh: StepErrors) -> np.ndarray:
-    """Return the relative error that is said with the force of each touch."""
+    """Return the estimated relative error of the force of each touch."""
     assert vademecum.certificate is not None
     return vademecum.certificate.force_error.relative(fresh.smoothing)
 
 
 def _force_figures(error: np.ndarray, said: np.ndarray) -> dict[str, float]:
-    """How many errors are covered by what is said, and by how much more that is in the median;
-    beside one error for all touches that covers as many.
+    """Return figures of the estimated errors: fraction of covered errors, and median overestimate.
+
+    Beside them stands one error for all touches that covers as many.
     """
     covered = float(np.mean(error <= said))
     return {

@@ -1,9 +1,10 @@
 """Time and memory of a patient and of an addition against the number of anatomies in an atlas.
 
 The anatomies are the template bent by smooth maps, with responses of a small rank and on a coarse
-grid, so that a thousand are written in minutes; each goes through the files of a real one. A
-patient is found by kriging among all, and combined from its neighbours (``interpolated``, without
-registration, which does not depend on the atlas). Every row is measured in a process of its own.
+grid. A thousand of them are therefore written in minutes; each goes through the same files as a
+real one. A patient is found by kriging among all, and combined from its neighbours
+(``interpolated``, without registration, which does not depend on the atlas). Every row is measured
+in a process of its own.
 """
 
 from __future__ import annotations
@@ -137,7 +138,7 @@ STUDY = AtlasSizeStudy()
 
 
 class _Member:
-    """Makes anatomies without registering or solving: the template bent, random modes."""
+    """Builder of anatomies without registration or solution: the template bent, random modes."""
 
     def __init__(self, frame: Frame, rank: int) -> None:
         self._frame, self._rank = frame, rank
@@ -196,7 +197,7 @@ def _addition(folder: Path, newcomer: SurfaceMesh) -> Row:
 
 
 def _on_paper(rows: Sequence[Row]) -> list[str]:
-    """What the slopes between the two largest atlases give for AT anatomies."""
+    """Return the extrapolation to AT anatomies by the slopes between the two largest atlases."""
     if len(rows) < 2:
         return []
     one, other = rows[-2:]

@@ -1,4 +1,4 @@
-"""Whether a budget of error is kept, on livers whose touches nothing was calibrated with."""
+"""Check of error budgets on livers whose touches were not used for calibration."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TOLERANCES = (0.02, 0.05, 0.10)  # of the displacement at the surface
 
 
 def budget_rows(vademecum: Vademecum, fresh: StepErrors) -> list[Row]:
-    """For each tolerance what is chosen, and the part of some fresh touches that keeps it.
+    """Return for each tolerance the chosen detail, and the fraction of fresh touches that keeps it.
 
     A tolerance that no detail of the vademecum keeps is refused: nothing is chosen.
     """

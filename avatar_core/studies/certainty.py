@@ -1,8 +1,9 @@
-"""How certain an answer is whose data are not: section by section, one picture.
+"""Certainty of an answer when the data are uncertain: section by section, one picture.
 
-A vademecum is exact to some per cent about a problem whose data are known to some tens of per cent.
-Each section of this study takes one of those data. A section is a module with a function that takes
-the organ and the sizes and returns a :class:`Section`; the study puts them side by side.
+A vademecum is exact to some per cent for a problem whose data are known to some tens of per cent.
+Each section of this study varies one of these data. A section is a module with a function that
+takes the organ and the sizes and returns a :class:`Section`. The study puts the sections side by
+side.
 """
 
 from __future__ import annotations

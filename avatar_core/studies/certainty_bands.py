@@ -1,8 +1,8 @@
 """Bands of a force against draws of the full finite element problem.
 
 A small organ with a tumour, over Poisson's ratio and the contrast, is built once. Each draw of the
-material is then also solved in full for the patch at some places. Both sides see the same draws, so
-that what differs is the vademecum's and its table's error, and not chance.
+material is then also solved in full for the patch at some places. Both sides see the same draws.
+The difference is therefore the error of the vademecum and its table, and not chance.
 """
 
 from __future__ import annotations
@@ -48,8 +48,9 @@ _N_VERTICES = 700
 
 
 def bands_section(surface: SurfaceMesh, settings: CertaintySettings, bar: ProgressBar) -> Section:
-    """Bands of a small organ, whatever the liver of the study: a thousand of its problems are
-    solved.
+    """Return the bands of a small organ, whatever the liver of the study.
+
+    A thousand of its problems are solved.
     """
     vademecum, problem = _small_organ(settings, bar)
     known, places = known_of(vademecum, KNOWN), starts_apart(vademecum, settings.n_places)
@@ -90,10 +91,11 @@ _BANDS = (
 
 
 def band_errors(rows: Sequence[Row]) -> tuple[float, float]:
-    """Return worst relative error of the edges of all bands, and of their ratios to the medians.
+    """Return the worst relative error of all bands' edges, and of their ratios to the medians.
 
-    The first holds the error of the force itself at a place, which `avatar show` tells: at a thin
-    edge it is large, as the felt surface is smoothed there. The second is that of the band alone.
+    The first includes the error of the force itself at a place, which `avatar show` prints. At a
+    thin edge it is large, because the contact surface is smoothed there. The second is the error of
+    the band alone.
     """
     low, median, high = (1.0 + column(rows, f"{name}_error") for name in ("low", "median", "high"))
     edges = np.concatenate([low, high])

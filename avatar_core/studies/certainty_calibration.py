@@ -2,8 +2,8 @@
 
 A small organ with a tumour, held by its bare area on springs, is built once over the tumour's
 contrast and the support's stiffness. The truth of each trial is the same anatomy on a finer mesh,
-at values that are drawn: its forces at the touches get the noise of a sensor, and the calibration
-has to find the values. Each is also fitted by a model without the tumour, whose fit must say so.
+at drawn values. Its forces at the touches get the noise of a sensor, and the calibration has to
+find the values. A model without the tumour is also fitted to each trial; its fit must be rejected.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ TRUE_YOUNG, TRUE_CONTRAST, TRUE_STIFFNESS = (3e3, 12e3), (2.0, 12.0), (2e6, 2e7)
 N_TOUCHES, N_AT_TUMOUR = 20, 8  # of a trial, and of them over the tumour
 POOL, POOL_AT_TUMOUR = 60, 20  # places that trials draw from, away from the tumour and over it
 APART = 4e-3  # places over the tumour, at least [m]
-WELL_KNOWN = 0.05  # error of a force that nine in ten keep, where a touch is worth it
+WELL_KNOWN = 0.05  # largest force error of a touch, which nine in ten keep
 NOISE = 0.02  # of a measured force
 DEPTHS = (2e-3, 4e-3, 6e-3)  # [m]
 TIP = Tip("patch", 8e-3)
@@ -70,7 +70,7 @@ class Truth:
     normals: FloatArray
 
     def stiffness(self, values: Mapping[str, float]) -> FloatArray:
-        """Force over depth of the patch at every touch, shape (n_touches,) [N/m]."""
+        """Return force over depth of the patch at every touch, shape (n_touches,) [N/m]."""
         stiffer = values["young"] / self.problem.material.young_modulus
         point = {"contrast": values["contrast"], SUPPORTED: values[SUPPORTED] / stiffer}
         solution = problem_at(self.problem, point).solve(self.loads)
@@ -83,7 +83,7 @@ class Truth:
 def calibration_section(
     surface: SurfaceMesh, settings: CertaintySettings, bar: ProgressBar
 ) -> Section:
-    """Calibration of a small organ, whatever the liver of the study: each trial is a solution."""
+    """Calibrate a small organ, whatever the liver of the study: each trial is a solution."""
     outline = phantom_liver()
     tumour = _tumour(outline)
     vademecum = _build(outline, tumour, settings.n_vertices, bar)
@@ -115,7 +115,7 @@ _FOUND = (
 
 
 def _tumour(outline: SurfaceMesh) -> SurfaceMesh:
-    """Below the middle of the front, which faces along y."""
+    """Return a tumour below the middle of the front, which faces along y."""
     middle = outline.vertices.mean(axis=0)
     off = outline.vertices - middle
     front = outline.vertices[np.argmin(np.hypot(off[:, 0], off[:, 2]) - off[:, 1])]
@@ -136,7 +136,7 @@ def _build(outline: SurfaceMesh, tumour: SurfaceMesh, n: int, bar: ProgressBar) 
 
 
 def _places(vademecum: Vademecum, tumour: SurfaceMesh) -> IntArray:
-    """Load positions: ``POOL_AT_TUMOUR`` over the tumour, then ``POOL`` far apart."""
+    """Return load positions: ``POOL_AT_TUMOUR`` over the tumour, then ``POOL`` far apart."""
     centers, inner = vademecum.surface.centers, _well_known(vademecum)
     near = _nearness(vademecum, tumour, inner)
     over = vademecum.surface.largest_apart(near, POOL_AT_TUMOUR, APART)
@@ -145,7 +145,7 @@ def _places(vademecum: Vademecum, tumour: SurfaceMesh) -> IntArray:
 
 
 def _nearness(vademecum: Vademecum, tumour: SurfaceMesh, among: IntArray) -> FloatArray:
-    """One over the distance from the tumour's middle; zero at positions that are not asked for."""
+    """Return one over the distance from the tumour's middle; zero at positions not asked for."""
     centers = vademecum.surface.centers
     found = np.zeros(len(centers))
     found[among] = 1.0 / np.linalg.norm(centers[among] - tumour.vertices.mean(axis=0), axis=1)
@@ -153,7 +153,7 @@ def _nearness(vademecum: Vademecum, tumour: SurfaceMesh, among: IntArray) -> Flo
 
 
 def _well_known(vademecum: Vademecum) -> IntArray:
-    """Return the inner positions at which the vademecum says itself that its force is right."""
+    """Return the inner positions where the vademecum's own force error is small."""
     inner = inner_positions(vademecum)
     error = force_error_at(vademecum, vademecum.surface.centers[inner])
     kept: IntArray = inner[error < WELL_KNOWN]
@@ -175,7 +175,7 @@ def _truth(
 
 
 def _path(vademecum: Vademecum, positions: IntArray) -> Palpation:
-    """Of all touches; forces are put in by each trial."""
+    """Return the path of all touches; each trial adds its forces."""
     depth = np.arange(-_ABOVE, DEPTHS[-1] + _STEP / 2.0, _STEP)
     sampled = np.isclose(depth[:, None], DEPTHS).any(axis=1)
     surface = vademecum.surface
@@ -189,7 +189,7 @@ def _path(vademecum: Vademecum, positions: IntArray) -> Palpation:
 
 
 def _depths(outline: SurfaceMesh, table: TouchTable) -> FloatArray:
-    """How deep the patch lies below the surface, whose exact place no mesh decides, (n, 3) [m]."""
+    """Return the patch's depth below the surface, which no mesh places exactly, (n, 3) [m]."""
     path = table.palpation
     off = outline.skin.signed_distance(path.tip[path.sampled])
     return np.asarray(TIP.offset - off).reshape(-1, len(DEPTHS))
@@ -222,7 +222,10 @@ def _trials(
 
 
 def _touches(rng: np.random.Generator) -> np.ndarray:
-    """Those of a trial, a mask of all places, (n,): drawn anew, as each place has its own error."""
+    """Return a trial's touches, a mask of all places (n,).
+
+    They are drawn anew, as each place has its own error.
+    """
     chosen = np.zeros(POOL_AT_TUMOUR + POOL, bool)
     chosen[rng.permutation(POOL_AT_TUMOUR)[:N_AT_TUMOUR]] = True
     chosen[POOL_AT_TUMOUR + rng.permutation(POOL)[: N_TOUCHES - N_AT_TUMOUR]] = True
@@ -230,7 +233,7 @@ def _touches(rng: np.random.Generator) -> np.ndarray:
 
 
 def _measured(table: TouchTable, force: FloatArray, rng: np.random.Generator) -> TouchTable:
-    """The table with the forces of a truth, (n_touches, n_depths), and the noise of a sensor."""
+    """Return the table with a truth's forces, (n_touches, n_depths), and a sensor's noise."""
     path = table.palpation
     noisy = path.force.copy()
     noisy[path.sampled] = force.ravel() * (1.0 + NOISE * rng.standard_normal(force.size))

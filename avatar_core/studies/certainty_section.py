@@ -1,4 +1,4 @@
-"""What sections of the study of certainty are made of, and their sizes."""
+"""Sections of the study of certainty, and their sizes."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from avatar_core.studies.study import Panel, Value
 
 @dataclass(frozen=True)
 class CertaintySettings:
-    """Sizes.
+    """Sizes of the sections.
 
-    n_vertices : of the mesh, about
+    n_vertices : approximate number of mesh vertices
     n_values : unseen values of a coordinate, beside the ends of its range
     n_loads : unseen load positions at each of them, three directions each
-    max_modes : at a place
-    n_draws : of the material, each solved in full
-    n_places : that are pressed for them
-    n_trials : of a calibration, each solved in full
-    n_registrations : of each class of deformations
+    max_modes : largest number of modes at a place
+    n_draws : draws of the material, each solved in full
+    n_places : pressed places for these draws
+    n_trials : trials of a calibration, each solved in full
+    n_registrations : registrations of each class of deformations
     """
 
     n_vertices: int = 2850
@@ -36,11 +36,11 @@ class CertaintySettings:
 class Section:
     """One question of the study and its answer.
 
-    name : of its rows; the keys of its summary begin with it
+    name : name of its rows; the keys of its summary begin with it
     sentence : the finding, in one sentence
-    summary, rows : as of :class:`avatar_core.studies.study.Run`
+    summary, rows : see :class:`avatar_core.studies.study.Run`
     panels : plots, each with its own sentence
-    notices : what was done differently, or found on the way, one line each
+    notices : deviations and findings on the way, one line each
     """
 
     name: str

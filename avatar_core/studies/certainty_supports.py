@@ -1,9 +1,9 @@
-"""How firmly the organ is held: a support's stiffness as a coordinate, and its two limits.
+"""Firmness of the hold: a support's stiffness as a coordinate, and its two limits.
 
-The bare area alone holds a liver, with a stiffness per area k over four decades. A vademecum over
-k answers unseen loads at unseen k; full finite elements say how far it is off. Beyond its range,
-finite elements alone: towards k -> infinity the clamp of the same faces, towards k -> 0 a rigid
-motion that grows as 1 / k until nothing holds it.
+The bare area alone holds a liver, with a stiffness per area k over four decades. A vademecum over k
+answers unseen loads at unseen k, against full finite elements. Beyond its range, finite elements
+alone are used. Towards k -> infinity the limit is the clamp of the same faces. Towards k -> 0 it is
+a rigid motion that grows as 1 / k until nothing holds the organ.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class _Held(Organ):
 def supports_section(
     surface: SurfaceMesh, settings: CertaintySettings, bar: ProgressBar
 ) -> Section:
-    """Return the vademecum over k, and the limits of full finite elements."""
+    """Build the vademecum over k, and compare the limits of full finite elements."""
     held = _held(surface, settings)
     start = time.process_time()
     rule = BuildRule(max_modes=settings.max_modes)
@@ -88,7 +88,7 @@ def _held(surface: SurfaceMesh, settings: CertaintySettings) -> _Held:
 
 
 def _unseen_rows(vademecum: Vademecum, held: _Held, settings: CertaintySettings) -> list[Row]:
-    """Errors at the ends and at one value drawn from each nth part of the range, one row each."""
+    """Return errors at the ends and at one value drawn from each nth part of the range."""
     rng, n = np.random.default_rng(1), settings.n_values
     drawn = [held.coordinate.value_at((part + rng.random()) / n) for part in range(n)]
     rows: list[Row] = []
@@ -112,7 +112,7 @@ def _unseen_rows(vademecum: Vademecum, held: _Held, settings: CertaintySettings)
 def _errors(
     vademecum: Vademecum, held: _Held, value: float, faces: np.ndarray
 ) -> tuple[FloatArray, FloatArray]:
-    """L2 of the displacement (3 n,) and of the contact compliance (n,) at centroids of faces."""
+    """Return L2 errors of displacement (3 n,) and contact compliance (n,) at faces' centroids."""
     name, surface, mesh = held.coordinate.name, held.loads, held.elasticity.mesh
     problem, here = problem_at(held.elasticity, {name: value}), vademecum.at({name: value})
     loads = patch_loads(problem, surface.centroids[faces], surface.patch_radius)
@@ -138,7 +138,7 @@ def _limit_loads(held: _Held) -> tuple[Elasticity, sp.csr_matrix]:
 
 
 def _clamp_rows(held: _Held) -> list[Row]:
-    """How far springs are from the clamp of the same faces."""
+    """Return the distance of springs from the clamp of the same faces."""
     elasticity, loads = _limit_loads(held)
     mesh, (support,) = elasticity.mesh, elasticity.supports
     clamped = Elasticity(mesh, elasticity.material, support.faces, elasticity.element)
@@ -160,7 +160,7 @@ def _clamp_rows(held: _Held) -> list[Row]:
 
 
 def _free_rows(held: _Held) -> tuple[list[Row], str]:
-    """The rigid part of displacements, until nothing holds the organ; and what is said then."""
+    """Return the rigid part of displacements until nothing holds the organ, and the error then."""
     elasticity, loads = _limit_loads(held)
     mass = elasticity.mesh.lumped_mass
     rows: list[Row] = []
@@ -184,7 +184,7 @@ def _free_rows(held: _Held) -> tuple[list[Row], str]:
 
 
 def rigid_part(mesh: TetMesh, displacement: FloatArray) -> FloatArray:
-    """The rigid motion nearest to displacements of the vertices in L2, shape (3 n_vertices, n)."""
+    """Return the rigid motion nearest to vertex displacements in L2, shape (3 n_vertices, n)."""
     away = mesh.vertices - mesh.vertices.mean(axis=0)
     turns = [np.cross(axis, away) for axis in np.eye(3)]
     shifts = [np.broadcast_to(axis, away.shape) for axis in np.eye(3)]

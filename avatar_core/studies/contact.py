@@ -1,10 +1,10 @@
 """Contact: the force of a real tip against resolved contact, Hertz, and the vademecum's own patch.
 
-Spheres of 1.5 to 10 mm, a cone and a punch press 1 to 5 mm deep at places drawn over each liver, a
-ridge and a hollow among them, and at its thinnest edges. The truth is Signorini's contact on the
-same organ, resolved (:mod:`avatar_core.offline.resolved_contact`), which is itself compared with
-Sneddon's exact sphere on a box. None of the livers took part in the calibration of the error that
-the step says. Some livers are also given turned, and meshed more coarsely.
+Spheres of 1.5 to 10 mm, a cone and a punch press 1 to 5 mm deep. Places are drawn over each liver,
+a ridge and a hollow among them, and at its thinnest edges. The truth is Signorini's contact on the
+same organ, resolved (:mod:`avatar_core.offline.resolved_contact`). It is itself compared with
+Sneddon's exact sphere on a box. None of the livers was used to calibrate the step's error estimate.
+Some livers are also given turned, and meshed more coarsely.
 """
 
 from __future__ import annotations
@@ -50,8 +50,10 @@ LIVERS = ("LiTS-20", "LiTS-50", "Amos-052", "Amos-086")  # not those of the cali
 
 @dataclass(frozen=True)
 class ContactSettings:
-    """Size of the study: livers by name, places and edges on each, tips and depths [m]; places
-    where a ball is pressed on each of some ``invariant`` livers that are given in other ways.
+    """Sizes of the study.
+
+    They are livers by name, places and edges on each, tips and depths [m], and the places where a
+    ball is pressed on each of the ``invariant`` livers, which are also turned and remeshed.
     """
 
     livers: tuple[str, ...] = LIVERS
@@ -131,7 +133,7 @@ STUDY = ContactStudy()
 def contacts_of(
     surface: SurfaceMesh, settings: ContactSettings, notices: list[str]
 ) -> list[SiteContact]:
-    """Return all contacts on one liver; what could not be resolved is counted in a notice."""
+    """Return all contacts on one liver; a notice counts contacts that could not be resolved."""
     vademecum = build(surface, settings.options)
     places = draw_sites(vademecum, surface, settings.n_places, seed=7)
     places += edge_sites(vademecum, surface, settings.n_edges, seed=7)
@@ -142,9 +144,9 @@ def contacts_of(
 
 
 def reference_error() -> float:
-    """Return worst relative error of the reference for a sphere of 3 mm, 1 and 2 mm deep in a cube.
+    """Return the reference's worst relative error for a sphere of 3 mm, 1 and 2 mm deep in a cube.
 
-    Against Sneddon's half-space; the cube of 200 mm is clamped at its bottom.
+    It is compared with Sneddon's half-space; the cube of 200 mm is clamped at its bottom.
     """
     tip, depths, material = Tip("sphere", 3e-3), (1e-3, 2e-3), Material()
     ticks = np.linspace(0.0, 0.2, 5)
@@ -166,7 +168,7 @@ def sneddon(tip: Tip, material: Material, depth: float) -> float:
 
 
 def summary_of(contacts: Sequence[SiteContact]) -> dict[str, float]:
-    """Return key figures; errors are relative, of the force along that of the resolved contact."""
+    """Return key figures; errors are those of the force along the resolved force, relative."""
     found = summarized(contacts)
     patch = np.array([abs(contact.patch / contact.truth - 1.0) for contact in contacts])
     hertz = np.array([abs(contact.hertz / contact.truth - 1.0) for contact in contacts])
@@ -231,7 +233,7 @@ def _row(name: str, contact: SiteContact) -> Row:
 
 
 def _draw_depths(axes: Axes, contacts: Sequence[SiteContact]) -> None:
-    """Force over depth at the first place, for the smallest and the largest sphere."""
+    """Draw force over depth at the first place, for the smallest and the largest sphere."""
     first = [c for c in contacts if c.site is contacts[0].site and c.tip.shape == "sphere"]
     radii = sorted({contact.tip.radius for contact in first})
     for radius, colour in ((radii[0], "crimson"), (radii[-1], "steelblue")):

@@ -42,10 +42,11 @@ RANKS = (40, 60, 100)  # modes at a place at most
 
 @dataclass(frozen=True)
 class CoordinatesSettings:
-    """Vertices of the meshes, unseen loads.
+    """Sizes of the study: vertices of the meshes, unseen loads.
 
-    n_pushed : sites of large pushes; n_combined : of combinations
-    patch_radius : of the loads, by default the organ's own [m]
+    n_pushed : sites of large pushes
+    n_combined : sites of combinations
+    patch_radius : radius of the loads, by default the organ's own [m]
     """
 
     n_vertices: int = 2850
@@ -170,7 +171,7 @@ def _parametric(
     settings: CoordinatesSettings,
     progress: Progress,
 ) -> list[Row]:
-    """Return the errors of the default against modes, and the time of its build."""
+    """Return errors of the default vademecum by number of modes, and the time of its build."""
     start = time.process_time()
     vademecum = organ.parametric(coordinates, BuildRule(), progress)
     seconds = time.process_time() - start
@@ -197,7 +198,7 @@ def _parametric(
 
 
 def _with_modes(vademecum: Vademecum, modes: int) -> Vademecum:
-    """Return the vademecum with so many modes at a place, at any value of its coordinates."""
+    """Return the vademecum with fewer modes at a place, at any value of its coordinates."""
     parametric = vademecum.parametric
     assert parametric is not None
     most = modes - parametric.n_global
@@ -210,7 +211,7 @@ def _with_modes(vademecum: Vademecum, modes: int) -> Vademecum:
 
 
 def _tumour_rows(settings: CoordinatesSettings, progress: Progress) -> list[Row]:
-    """Return Poisson's ratio and the contrast of real tumours together."""
+    """Return rows of Poisson's ratio and the contrast of real tumours together."""
     liver, tumour = TUMOUR_FOLDER / "liver.vtk", TUMOUR_FOLDER / "liver_tumours.vtk"
     if not liver.is_file():
         return []
@@ -226,7 +227,7 @@ def _tumour_rows(settings: CoordinatesSettings, progress: Progress) -> list[Row]
 def _large(
     organ: Organ, material: LargeMaterial, settings: CoordinatesSettings, progress: Progress
 ) -> list[Row]:
-    """Return one material: its summary, every push, and combinations of neo-Hookean ones."""
+    """Return rows of one material: its summary, every push, and neo-Hookean combinations."""
     start = time.process_time()
     linear = organ.linear(BuildRule(), progress)
     problem = hyperelastic_problem(linear, material)
@@ -260,7 +261,7 @@ def _large(
 
 
 def _pace(linear: Vademecum, bent: Vademecum) -> float:
-    """Return the time of a step with large deformation over that without, all modes; medians."""
+    """Return the median time of a step with large deformation over that without, all modes."""
     times = [time_steps(one, 1).p50_us for one in (linear, bent)]
     return times[1] / times[0]
 

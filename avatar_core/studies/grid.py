@@ -5,9 +5,9 @@ A member of the base has weight one on itself, so that all of its error comes fr
 - volume: of the level set (as the library computes it) and of its marching-cubes surface;
 - distance: phi at random points of the organ, read from the grid trilinearly, against the exact
   one, relative L2 (Fig. 9d);
-- displacement: finite element solutions stored at grid points, as the paper stores u(x, s), and
-  interpolated back to the mesh's vertices, relative L2 over the organ, mean and worst over patch
-  loads;
+- displacement: finite element solutions stored at grid points, like the paper stores u(x, s), and
+  interpolated back to the mesh's vertices. The error is relative L2 over the organ, mean and worst
+  over patch loads;
 - remeshed displacement: finite elements on a new mesh of the marching-cubes surface against the
   mesh of the original one, same clamp and loads. Its floor is the error of another mesh of the
   original surface (h = 0).
@@ -44,7 +44,7 @@ OTHER_MESH = 0.85  # vertices of the second mesh of the same surface, relative
 
 @dataclass(frozen=True)
 class GridSettings:
-    """Numbers of livers, of those at 1 mm and with displacements; mesh, loads, sample points."""
+    """Numbers of livers, also at 1 mm and with displacements; mesh, loads, sample points."""
 
     n_livers: int | None = None
     n_fine: int = 6
@@ -190,7 +190,7 @@ def other_mesh_row(surface: SurfaceMesh, reference: Reference, settings: GridSet
 
 
 def reference_of(surface: SurfaceMesh, settings: GridSettings) -> Reference:
-    """Finite elements on the mesh of the surface, loads spread over its accessible region."""
+    """Return finite elements on the mesh of the surface, with loads over its accessible region."""
     mesh = tetrahedralize(surface, settings.n_vertices)
     regions = regions_by_rule(mesh)
     loads = load_surface(mesh, regions)
@@ -201,7 +201,7 @@ def reference_of(surface: SurfaceMesh, settings: GridSettings) -> Reference:
 
 
 def passage_errors(reference: Reference, origin: FloatArray, h: float) -> FloatArray:
-    """Of the responses kept on a grid and read back, shape (n_loads,)."""
+    """Return errors of the responses stored on a grid and read back, shape (n_loads,)."""
     corners, back = trilinear(reference.mesh.vertices, origin, h)
     there_and_back = (back @ interpolation_matrix(reference.mesh, corners)).tocsr()
     found = carried(there_and_back, reference.responses)
@@ -209,7 +209,7 @@ def passage_errors(reference: Reference, origin: FloatArray, h: float) -> FloatA
 
 
 def remeshed_errors(surface: SurfaceMesh, reference: Reference, n_vertices: int) -> FloatArray:
-    """Of finite elements on a new mesh, read at the vertices of the old one, shape (n_loads,)."""
+    """Return errors of finite elements on a new mesh, read at the old vertices, (n_loads,)."""
     mesh = tetrahedralize(surface, n_vertices)
     middle = mesh.vertices[mesh.boundary_faces].mean(axis=1)
     own = reference.mesh

@@ -1,8 +1,8 @@
-"""Fifty livers generated from one by Eq. 17 (paper, Sec. 3.2): whether LLE finds the six
-parameters, and how well it interpolates shape and displacement.
+"""Fifty livers generated from one by Eq. 17 (paper, Sec. 3.2).
 
-All livers have the same mesh, moved by the maps of Eq. 17, so that nodes correspond: Eq. 18 is
-evaluated nodewise and, as in the paper, at the points of the common grid.
+The study asks whether LLE finds the six parameters, and how well it interpolates shape and
+displacement. All livers have the same mesh, moved by the maps of Eq. 17, so that nodes correspond.
+Eq. 18 is evaluated nodewise and, like in the paper, at the points of the common grid.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class InSilicoStudy(Study[InSilicoSettings]):
 
     @repeatable
     def measure(self, run: Run[InSilicoSettings]) -> None:
-        """The embedding of all livers is kept for the picture."""
+        """Measure, and keep the embedding of all livers for the picture."""
         livers = populate(run.settings)
         n = run.settings.n_base
         spectra = [spectrum_row(livers.vectors, k, r) for k, r in SPECTRA if k < n]
@@ -151,7 +151,7 @@ STUDY = InSilicoStudy()
 
 
 def populate(settings: InSilicoSettings) -> Population:
-    """The phantom moved by the maps of Eq. 17: distances, meshes and finite element answers."""
+    """Return the phantom moved by the maps of Eq. 17: distances, meshes and responses."""
     organ = phantom_liver(settings.phantom_spacing)
     maps = population(settings.n_base + settings.n_held_out, settings.seed)
     moved = [shape.moved(organ) for shape in maps]
@@ -171,7 +171,7 @@ def populate(settings: InSilicoSettings) -> Population:
 
 
 def spectrum_row(vectors: FloatArray, k: int, regularization: float) -> Row:
-    """Dimension by the largest ratio of neighbouring eigenvalues, and whether the sixth leads."""
+    """Return the dimension by the largest ratio of eigenvalues, and whether the sixth leads."""
     base = LLE(k, regularization=regularization).fit(vectors)
     found = base.dimension(n_values=PARAMETERS + 8)
     values = np.maximum(found.eigenvalues, np.finfo(float).eps * len(base.vectors_))
@@ -220,7 +220,7 @@ def held_out_rows(livers: Population, settings: InSilicoSettings) -> list[Row]:
 
 
 def _through_grid(livers: Population, point: Barycenter, mesh: TetMesh) -> FloatArray:
-    """Eq. 18 at the grid points, read at the vertices of the patient's mesh."""
+    """Return Eq. 18 at the grid points, read at the vertices of the patient's mesh."""
     corners, back = trilinear(mesh.vertices, np.array(livers.box.origin), livers.box.spacing)
     total = np.zeros((len(mesh.vertices), *livers.responses[0].shape[1:]))
     for weight, j in zip(point.weights, point.neighbors, strict=True):
@@ -230,7 +230,7 @@ def _through_grid(livers: Population, point: Barycenter, mesh: TetMesh) -> Float
 
 
 def _passage(livers: Population, i: int, mesh: TetMesh) -> FloatArray:
-    """The patient's own field interpolated to the grid and back: the error of the grid alone."""
+    """Return the patient's own field through the grid and back: the error of the grid alone."""
     corners, back = trilinear(mesh.vertices, np.array(livers.box.origin), livers.box.spacing)
     return carried((back @ interpolation_matrix(mesh, corners)).tocsr(), livers.responses[i])
 

@@ -1,10 +1,10 @@
 """A rigid sphere in a neo-Hookean half-space: the curve that the step adds to small strain.
 
-F / (E R^2) over depth / R for several Poisson's ratios, by axisymmetric finite elements
-(:mod:`avatar_core.fem.sphere_indentation`), beside Sneddon's exact sphere at small strain and
-Hertz's paraboloid. The same elements at small strain show how far they are from Sneddon, elements
-of half the size what they miss at large strain. The coefficients that
-:mod:`avatar_core.tips.large_strain` stores are fitted anew; they are the rows of kind
+The curve is F / (E R^2) over depth / R for several Poisson's ratios, by axisymmetric finite
+elements (:mod:`avatar_core.fem.sphere_indentation`). Beside it stand Sneddon's exact sphere at
+small strain and Hertz's paraboloid. At small strain the elements are compared with Sneddon, at
+large strain with elements of half the size. The coefficients that
+:mod:`avatar_core.tips.large_strain` stores are fitted anew. They are the rows of kind
 "coefficients" of the record.
 """
 
@@ -36,7 +36,7 @@ _SHOWN = (0.3, 0.45, 0.49)  # nu
 
 @dataclass(frozen=True)
 class IndentationSettings:
-    """Poisson's ratios, those at which the elements are halved, depths [R], elements [R]."""
+    """Poisson's ratios, those with halved elements, depths [R], elements [R]."""
 
     ratios: tuple[float, ...] = (0.0, 0.2, 0.3, 0.4, 0.45, 0.48, 0.49)
     halved: tuple[float, ...] = _SHOWN
@@ -52,7 +52,7 @@ class IndentationStudy(Study[IndentationSettings]):
     quick = IndentationSettings(ratios=_SHOWN, halved=(0.45,), depths=_COMPARED, element=0.2)
 
     def measure(self, run: Run[IndentationSettings]) -> None:
-        """The coefficients fitted anew are kept as a table, too."""
+        """Measure, and keep the coefficients fitted anew as a table."""
         settings = run.settings
         domain, half = Domain(settings.element), Domain(0.5 * settings.element)
         for nu in follow(settings.ratios, "neo-Hookean"):
@@ -126,7 +126,7 @@ STUDY = IndentationStudy()
 
 
 def small_strain_depth(load: float) -> float:
-    """Depth [R] of a sphere in a half-space under the load F / (E* R^2), by Sneddon's solution."""
+    """Return a sphere's depth in a half-space [R] under the load F / (E* R^2), by Sneddon."""
     if load == 0.0:
         return 0.0
 
@@ -139,7 +139,7 @@ def small_strain_depth(load: float) -> float:
 
 
 def law_depth(load: float, law: np.ndarray) -> float:
-    """Return the same at large strain, by c_0 ... c_3 of the law; within the range of its fit."""
+    """Return the depth at large strain, by c_0 ... c_3 of the law; within the range of its fit."""
     s = np.cbrt(0.75 * load)
     return small_strain_depth(load) + float(s**3 * (law[:4] @ s ** np.arange(4)))
 

@@ -1,6 +1,6 @@
 """The force of a ball on one organ that is given in two ways: turned, or meshed more coarsely.
 
-Nothing that a patient has differs between both, so that the forces should not.
+The patient is the same, so that the forces should be the same.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ class Differences:
     """Differences of the forces at some places of an organ given in two ways.
 
     difference : ndarray, shape (n,), |F' / F - 1|, F of the first way
-    said : ndarray, shape (n,), the sum of the errors of both as the step says them, over F
+    said : ndarray, shape (n,), the sum of both estimated errors of the step, over F
     """
 
     difference: np.ndarray
     said: np.ndarray
 
     def figures(self, name: str) -> dict[str, float]:
-        """Return the quantiles, and the part of the places that the errors said cover."""
+        """Return the quantiles, and the fraction of places that the estimated errors cover."""
         return {
             f"{name}_median": float(np.median(self.difference)),
             f"{name}_p95": float(np.quantile(self.difference, 0.95)),
@@ -49,9 +49,9 @@ class Differences:
 
 
 def differences(surface: SurfaceMesh, options: OrganOptions, n: int) -> dict[str, float]:
-    """Return figures of the organ turned, and of its coarser mesh, beside the organ as it is given.
+    """Return figures of the organ turned, and of its coarser mesh, against the given organ.
 
-    All three are held, and open to tools, at the same points: rules go by the axes.
+    All three are held, and open to tools, at the same points, because rules depend on the axes.
     """
     cosine, sine = np.cos(TURN), np.sin(TURN)
     turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
@@ -83,7 +83,7 @@ def _groups(mesh: TetMesh) -> dict[str, np.ndarray]:
 def _between(
     one: Vademecum, here: Sequence[Site], other: Vademecum, there: Sequence[Site]
 ) -> Differences:
-    """Where both touch: at the border of the accessible surface, one of them may not."""
+    """Compare places where both touch: at the border of the access, one of them may not."""
     first, second = (_forces(v, sites) for v, sites in ((one, here), (other, there)))
     both = np.isfinite(first[0] + second[0])
     (a, error_a), (b, error_b) = first[:, both], second[:, both]
@@ -91,7 +91,7 @@ def _between(
 
 
 def _forces(vademecum: Vademecum, sites: Sequence[Site]) -> np.ndarray:
-    """Sizes of the forces, and the errors that are said, shape (2, n) [N]; NaN if refused."""
+    """Return sizes of the forces, and their estimated errors, (2, n) [N]; NaN if refused."""
     data = model_of(vademecum, (BALL,), cloud="off", effects=()).data()
     found = np.empty((2, len(sites)))
     for k, site in enumerate(sites):

@@ -1,8 +1,8 @@
 """Each real liver interpolated from the others (paper, Sec. 3.3): LLE and its rivals.
 
-Every method yields weights that sum to one, and all are judged alike: the blended signed distances
+Every method yields weights that sum to one, and all are judged alike. The blended signed distances
 are re-initialised near the surface, and the Dice overlap with the true liver is measured. Livers
-are compared with centred volumes, and aligned to the phantom by a similarity transform; lengths are
+are compared with centred volumes, and aligned to the phantom by a similarity transform. Lengths are
 always those of the patient. Scans of one person are left out together. Each method may choose its
 best setting: LLE among numbers of neighbours up to all, PCA among numbers of components up to all.
 """
@@ -61,11 +61,12 @@ ALIGNMENTS = ("centred", "similarity")
 class LeaveOneOutSettings:
     """Sizes of the study, and the settings that each method may choose from.
 
-    n_livers : at most; None for all
-    neighbors, regularizations : of LLE; 0 neighbours are all
-    least_regularizations : further ones, with all neighbours only
-    components : of PCA; 0 are as many as there are
-    shape : of the grid; phantoms : number that stand in for a missing folder
+    n_livers : largest number of livers; None for all
+    neighbors, regularizations : settings of LLE; 0 neighbours are all
+    least_regularizations : further regularizations, with all neighbours only
+    components : settings of PCA; 0 are as many as there are
+    shape : shape of the grid
+    phantoms : number that replaces a missing folder
     """
 
     n_livers: int | None = None
@@ -82,7 +83,7 @@ class Base:
     """Livers on one grid.
 
     vectors : ndarray, shape (n, D), signed distances [m]
-    scales : ndarray, shape (n,), from lengths on the grid to those of the patient
+    scales : ndarray, shape (n,), lengths of the patient over those on the grid
     subjects : ndarray of int, shape (n,), equal for scans of one person
     notices : livers whose alignment did not converge
     """
@@ -99,7 +100,7 @@ class Base:
 class Method:
     """A way to write liver i by some others: weights(i, others) has the shape of others.
 
-    k : neighbours, or principal components
+    k : number of neighbours, or of principal components
     """
 
     name: str
@@ -135,7 +136,7 @@ class LeaveOneOutStudy(Study[LeaveOneOutSettings]):
         )
 
     def summary(self, run: Run[LeaveOneOutSettings]) -> dict[str, float]:
-        """Return best setting of each method; for k = 10 the best regularisation and alignment."""
+        """Return each method's best setting; for k = 10 the best regularisation and alignment."""
         lle = where(run.rows, method="LLE")
         top, ten = _best(lle), _best(where(lle, k=K_PAPER) or lle)
         summary = {
@@ -267,14 +268,14 @@ def judged(base: Base, method: Method) -> Row:
 
 
 def overlap(blend: FloatArray, target: FloatArray, box: GridBox) -> float:
-    """Return the Dice of a blended level set with a distance; 0 if the blend has no surface."""
+    """Return the Dice overlap of a blended level set with a distance; 0 without a surface."""
     if not (blend < 0).any():
         return 0.0
     return dice(sharpened(as_grid(blend, box)), as_grid(target, box))
 
 
 def sharpened(grid: DistanceGrid) -> DistanceGrid:
-    """Exact distances near the zero surface; elsewhere only the sign counts for the overlap."""
+    """Return exact distances near the zero surface; elsewhere only the sign counts for overlap."""
     zero = isosurface(grid)
     values = grid.values.ravel().copy()
     near = np.flatnonzero(np.abs(values) < NEAR * grid.spacing)
@@ -286,9 +287,9 @@ def sharpened(grid: DistanceGrid) -> DistanceGrid:
 
 
 def lle_weights(gram: Gram, k: int, regularization: float, i: int, others: IntArray) -> FloatArray:
-    """Eq. 15 among the k nearest others, from the products of the whole base.
+    """Return weights by Eq. 15 among the k nearest others, from the products of the whole base.
 
-    What `barycenter` does from differences, a hundred times faster when there are many settings.
+    `barycenter` computes the same from differences, a hundred times slower for many settings.
     """
     squared = gram.squared_distances(np.array([i]))[0, others]
     near = np.argsort(squared, kind="stable")[:k]
@@ -298,12 +299,12 @@ def lle_weights(gram: Gram, k: int, regularization: float, i: int, others: IntAr
 
 
 def hull_weights(gram: Gram, i: int, others: IntArray) -> FloatArray:
-    """Return the closest point of the convex hull of all others."""
+    """Return the weights of the closest point of the convex hull of all others."""
     return convex_weights(_local(gram, i, others))
 
 
 def inverse_weights(gram: Gram, k: int, i: int, others: IntArray) -> FloatArray:
-    """Return the proportional to 1 / distance among the k nearest others."""
+    """Return weights proportional to 1 / distance among the k nearest others."""
     distance = np.sqrt(gram.squared_distances(np.array([i]))[0, others])
     weights = 1.0 / np.maximum(distance, 1e-12)
     weights[np.argsort(distance, kind="stable")[k:]] = 0.0
@@ -311,11 +312,11 @@ def inverse_weights(gram: Gram, k: int, i: int, others: IntArray) -> FloatArray:
 
 
 def principal_weights(gram: Gram, n_components: int, i: int, others: IntArray) -> FloatArray:
-    """Projection on the first principal components of the others, as weights that sum to one.
+    """Return weights of the projection on the others' first principal components, summing to one.
 
-    With the centred products G = V L V^T and the centred products c with the liver itself,
-    w = 1/n + V_d L_d^-1 V_d^T c. Components without variance do not count: of n livers, there are
-    at most n - 1.
+    The centred products are G = V L V^T, the centred products with the liver itself c. The weights
+    are w = 1/n + V_d L_d^-1 V_d^T c. Components without variance do not count: n livers have at
+    most n - 1 components.
     """
     products = gram.products[np.ix_(others, others)]
     mean = products.mean(axis=0)

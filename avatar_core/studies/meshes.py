@@ -1,6 +1,6 @@
-"""Meshes of real organs: how near the surface they are, how well shaped, what they cost.
+"""Meshes of real organs: their distance from the surface, element shapes, and cost.
 
-For each surface, meshed as `avatar vademecum` does:
+For each surface, meshed like by `avatar vademecum`:
 
 - volume: of the mesh over that inside the surface, less one;
 - distance: of random points of the mesh's boundary from the surface, rms and worst, and worst of
@@ -9,8 +9,8 @@ For each surface, meshed as `avatar vademecum` does:
 - processor time of mesh and regions, fTetWild's process included;
 - built again: whether a second mesh of the same surface is the same, bit for bit.
 
-And of their vademecums, built in full: certificates and processor time, and for some of them the
-error of the mesh itself, by one refinement.
+For their vademecums, built in full: certificates and processor time, and for some of them the error
+of the mesh itself, by one refinement.
 """
 
 from __future__ import annotations
@@ -35,10 +35,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MeshesSettings:
-    """Numbers of livers, of those built in full, of those whose mesh error is measured, and of
-    those meshed twice, None for all; sizes of the work.
+    """Numbers of livers: all, built in full, with measured mesh error, and meshed twice.
 
-    n_vertices, n_certified : of `avatar vademecum`; n_points : on each boundary
+    None stands for all.
+
+    n_vertices, n_certified : options of `avatar vademecum`
+    n_points : points on each boundary
     """
 
     n_livers: int | None = None
@@ -167,7 +169,7 @@ def _same(one: TetMesh, other: TetMesh) -> bool:
 
 
 def _certified(surface: SurfaceMesh, settings: MeshesSettings, refined: bool) -> Row:
-    """Return errors of the vademecum's certificate, relative, and processor time of its build [s].
+    """Return relative errors of the vademecum's certificate, and its build's processor time [s].
 
     refined : measure the error of the mesh as well; the time then includes it and is left out
     """

@@ -1,6 +1,6 @@
 """Offline accuracy against time: size of the mesh.
 
-Each row has an error, what it is of, and the CPU seconds that it took.
+Each row has an error, its kind, and its CPU seconds.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from avatar_core.studies.study import Row, follow
 
 
 def mesh_rows(surface: SurfaceMesh, sizes: tuple[int, ...]) -> list[Row]:
-    """Vademecums on meshes of several sizes: the change when each is refined, and the whole build.
+    """Return vademecums on meshes of several sizes: the change by refinement, and the build.
 
-    The error is that of the mesh, not of the vademecum, which every size keeps alike.
+    The error is the mesh's, not the vademecum's, which is alike at every size.
     """
     rows: list[Row] = []
     for n in follow(sizes, "mesh size"):

@@ -1,7 +1,7 @@
 """Online accuracy against time: every point of the accuracy curve, and rivals, in one run.
 
-Errors are the 95 % quantile over fresh contacts, the rivals' where the tip presses and not through
-the stencil of a step; times are whole steps on this machine.
+Errors are the 95 % quantile over fresh contacts. The rivals' errors are taken where the tip
+presses, and not through the stencil of a step. Times are whole steps on this machine.
 
     vademecum      global modes and those of the place's region, as a step shows it
     SVD optimum    the best basis for 150 solved loads, judged on others; one for all places
@@ -47,7 +47,7 @@ _BATCH = 40
 
 @dataclass(frozen=True, eq=False)
 class Promises:
-    """How far certified errors held for fresh touches.
+    """Certified errors against fresh touches.
 
     errors_kept : fraction of all pairs of a point and a fresh touch within the certified error
     points_kept : fraction of the points whose certified error holds for 95 % of the fresh touches
@@ -66,7 +66,7 @@ def promises(curve: AccuracyCurve, fresh: StepErrors) -> Promises:
 
 
 def curve_rows(curve: AccuracyCurve) -> list[Row]:
-    """The points of a curve; on the front: none of the same cloud is both faster and better."""
+    """Return a curve's points; those on the front have no faster and better one of their cloud."""
     front = {id(p) for cloud in ("surface", "volume") for p in curve.of(cloud).front()}
     return [_row("vademecum", p, id(p) in front) for p in curve.points if p.detail.cloud != "off"]
 
@@ -91,10 +91,10 @@ def _row(method: str, point: CurvePoint, front: bool = False) -> Row:
 def rival_rows(
     vademecum: Vademecum, elasticity: Elasticity, curve: AccuracyCurve, n_loads: int, seed: int
 ) -> list[Row]:
-    """The rivals with all vertices shown, on fresh loads, by the processor's time as the curve.
+    """Return the rivals with all vertices shown, on fresh loads, by processor time.
 
-    The table's time is that of all modes on the curve, times the ratio of both in turns: the
-    curve was timed minutes before, on a machine with neighbours.
+    The table's time is the curve's time with all modes, times the ratio of both in turns: the curve
+    was timed minutes before, on a machine with neighbours.
     """
     surface, mass = vademecum.surface, vademecum.mesh.lumped_mass
     contacts = draw_contacts(vademecum, n_loads, seed)
@@ -115,7 +115,7 @@ def rival_rows(
 
 
 def _table_time(vademecum: Vademecum, curve: AccuracyCurve) -> StepRow:
-    """Of a dense table, on the clock of the curve."""
+    """Return the time of a dense table, on the clock of the curve."""
     whole = Detail(vademecum.n_modes, "volume")
     (ours,) = (point for point in curve.points if point.detail == whole)
     row = time_dense_table(vademecum, 1, time.thread_time)
@@ -153,7 +153,7 @@ def _table_errors(
     truth: np.ndarray,
     mass: np.ndarray,
 ) -> np.ndarray:
-    """Errors (n,) of exact columns at the load positions, interpolated to places of contacts."""
+    """Return errors (n,) of exact columns at load positions, interpolated at contacts' places."""
     surface = vademecum.surface
     positions, weights = closest_weights(surface, contacts.place)
     needed, index = np.unique(positions, return_inverse=True)
@@ -186,7 +186,10 @@ def _optimum_rows(
 
 
 def cost_of_effects(vademecum: Vademecum) -> list[Row]:
-    """Times of a step with each effect alone that a linear vademecum serves, surface and volume."""
+    """Return times of a step with each effect alone that a linear vademecum supports.
+
+    The cloud is the surface or the volume.
+    """
     every = cases_on(vademecum)
     cases = [case for case in every if not isinstance(case[2][0], LargeDeformation)]
     return [

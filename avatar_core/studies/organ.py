@@ -35,7 +35,7 @@ class Organ:
         tumour: SurfaceMesh | None = None,
         patch_radius: float | None = None,
     ) -> Organ:
-        """With regions by the anatomical rule, and a tumour of the organ's own stiffness."""
+        """Return organ with regions by the anatomical rule, and a tumour of its own stiffness."""
         mesh = tetrahedralize(surface, n_vertices)
         regions = regions_by_rule(mesh)
         inclusion = None
@@ -46,13 +46,13 @@ class Organ:
 
     @property
     def tip_field(self) -> TipField:
-        """Where tips touch it."""
+        """Geometry that tips touch."""
         mesh, radius = self.elasticity.mesh, self.loads.patch_radius
         return make_tip_field(mesh, self.regions, radius, self.outline)
 
     @property
     def provenance(self) -> Provenance:
-        """The surface that it was made of."""
+        """Surface that it was made from."""
         return Provenance(self.outline.name, self.outline.source_sha256)
 
     def linear(self, rule: BuildRule, progress: Progress) -> Vademecum:

@@ -1,9 +1,9 @@
 """Error against modes for the paper's liver (Fig. 3): 66 load nodes, one direction.
 
-The paper reports an error below 10 % with 11 modes, and does not say of what. Here the error is the
-relative mass-weighted L2 norm of displacement for each load, mean and worst, for loads on patches
-and on single nodes, against full finite elements; beside it that of the displacement in contact,
-f . u of the load. The methods:
+The paper reports an error below 10 % with 11 modes, and does not define it. Here the error is the
+relative mass-weighted L2 norm of displacement for each load, against full finite elements. It is
+given as mean and worst, for loads on patches and on single nodes. Beside it stands the error of the
+displacement in contact, f . u of the load. The methods:
 
     paper     greedy enrichment, one pair at a time, in the energy norm
     SVD       the best that any n modes can do, relative errors counted
@@ -49,10 +49,11 @@ class PGDSettings:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """The loads, their exact answers and what counts.
+    """The loads, their exact responses and weights.
 
-    exact : ndarray, shape (3 n_vertices, n_loads) [m/N]; work : (n_loads,), f . u
-    region : ndarray, shape (n_loads,), of each load
+    exact : ndarray, shape (3 n_vertices, n_loads) [m/N]
+    work : ndarray, shape (n_loads,), f . u
+    region : ndarray, shape (n_loads,), region of each load
     """
 
     elasticity: Elasticity
@@ -63,12 +64,12 @@ class Case:
 
     @property
     def mass(self) -> FloatArray:
-        """Lumped, shape (3 n_vertices,)."""
+        """Lumped mass, shape (3 n_vertices,)."""
         return self.elasticity.mesh.lumped_mass
 
     @property
     def size(self) -> FloatArray:
-        """L2 norm of each answer."""
+        """L2 norm of each exact response."""
         return l2_norm(self.exact, self.mass)
 
 
@@ -93,11 +94,11 @@ class PGDStudy(Study[PGDSettings]):
 
     def summary(self, run: Run[PGDSettings]) -> dict[str, float]:
         def at(method: str, key: str, kind: str = "patch") -> float:
-            """Of 11 modes."""
+            """Return the error of 11 modes."""
             return float(column(where(run.rows, method=method, modes=11, loads=kind), key)[0])
 
         def modes_for(method: str, kind: str) -> float:
-            """Return the least number that leaves less than ``ENOUGH``."""
+            """Return the least number of modes with an error below ``ENOUGH``."""
             found = where(run.rows, method=method, loads=kind)
             modes = column(found, "modes")[column(found, "l2_mean") < ENOUGH]
             return float(modes[0]) if len(modes) else float("nan")
@@ -235,14 +236,14 @@ def _pgd(case: Case, rule: PGDRule, relative: bool) -> SeparatedField:
 
 
 def _shared(case: Case, n_modes: int) -> SeparatedField:
-    """The modes of all loads as a build finds them, at the vertices, by displacement norm."""
+    """Return the modes of all loads like in a build, at the vertices, by displacement norm."""
     found = _pgd(case, PGDRule(n_modes, 1e-12), relative=True)
     modes = SeparatedField(case.elasticity.at_vertices(found.space), found.load)
     return modes.sorted_by_norm(case.mass, 1.0 / case.size**2)
 
 
 def _two_levels_leave(case: Case, shared: SeparatedField, rank: int) -> FloatArray:
-    """What so many modes at a place leave of the displacement, in a build's parts."""
+    """Return the displacement error of ``rank`` modes at a place, divided like in a build."""
     rule = BuildRule(tolerance=1e-12, max_modes=rank)
     left = case.exact - shared.truncate(rule.n_global).evaluate()
     most = RegionalRule(0.0, 0.0, rank - rule.n_global)

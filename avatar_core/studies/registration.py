@@ -1,8 +1,8 @@
 """Organs registered to synthetic clouds, beside a rigid motion alone and thin-plate splines.
 
 The truth is hyperelastic (:mod:`avatar_core.studies.registration_truth`), the vademecum's response
-that of small strains. Errors are those of all vertices of the true mesh, in the cloud's frame,
-weighted by their volumes.
+linear. Errors are those of all vertices of the true mesh, in the cloud's frame, weighted by their
+volumes.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ STUDY = RegistrationStudy()
 def registration_section(
     surface: SurfaceMesh, settings: CertaintySettings, bar: ProgressBar
 ) -> Section:
-    """Return a vademecum registered to deformations of another mesh."""
+    """Register a vademecum to deformations of another mesh."""
     sizes = RegistrationSettings(
         n_vertices=settings.n_vertices,
         n_true=int(_FINER * settings.n_vertices),
@@ -143,7 +143,10 @@ def case_rows(vademecum: Vademecum, truth: Truth, settings: RegistrationSettings
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, float]:
-    """Means over the cases, all and of each class; ``registration_seconds`` is the median."""
+    """Return means over the cases, all and of each class.
+
+    ``registration_seconds`` is the median.
+    """
 
     def mean(key: str, kind: str | None = None) -> float:
         return float(column(_of(rows, kind), key).mean())
@@ -171,7 +174,7 @@ def _others(rows: Sequence[Row]) -> list[Row]:
 
 
 def draw_determined(axes: Axes, shown: Shown) -> None:
-    """Half of the 90 % interval over the organ, from the front, and the cloud."""
+    """Draw half of the 90 % interval over the organ, from the front, and the cloud."""
     x, _, z = 1e3 * shown.place.T
     drawn = axes.scatter(x, z, c=1e3 * shown.interval, s=9, cmap="viridis", vmin=0.0)
     axes.plot(*(1e3 * shown.cloud[::20, [0, 2]].T), "k.", markersize=1.5, label="cloud")
@@ -238,9 +241,10 @@ def measured(vademecum: Vademecum, case: Case) -> Row:
 def splines(
     vademecum: Vademecum, cloud: Cloud, rigid: RigidMotion
 ) -> Callable[[FloatArray], FloatArray]:
-    """Thin-plate splines from feet on the rigidly moved organ to the cloud, as a map of its rest.
+    """Return thin-plate splines as a map of the organ at rest.
 
-    Their smoothing is that which best predicts every other point.
+    They lead from feet on the rigidly moved organ to the cloud. Their smoothing is the one that
+    best predicts every other point.
     """
     mesh = vademecum.mesh
     points = rigid.back(cloud.thinned()[:: max(1, len(cloud.thinned()) // _N_SPLINE)])
@@ -263,7 +267,7 @@ _SMOOTHINGS = (1e-5, 1e-4, 1e-3, 1e-2)
 
 
 def draw_errors(axes: Axes, rows: Sequence[Row]) -> None:
-    """Mean error over mean displacement, of each class and method."""
+    """Draw mean error over mean displacement, for each class and method."""
     for k, name in enumerate(METHODS):
         error = [100.0 * value for value in _by_class(rows, f"{name}_error")]
         axes.bar(np.arange(len(CLASSES)) + 0.27 * (k - 1), error, 0.25, label=name)
@@ -274,7 +278,7 @@ def draw_errors(axes: Axes, rows: Sequence[Row]) -> None:
 
 
 def draw_coverage(axes: Axes, rows: Sequence[Row]) -> None:
-    """Part of the vertices that intervals of 90 % hold, of each class."""
+    """Draw the fraction of vertices within their 90 % intervals, for each class."""
     coverage = [100.0 * value for value in _by_class(rows, "coverage")]
     axes.bar(np.arange(len(CLASSES)), coverage, 0.6, color="grey")
     axes.axhline(90.0, color="black", linestyle=":")

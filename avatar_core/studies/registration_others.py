@@ -1,8 +1,8 @@
-"""Registration by truths that others measure by, with each prior that a user can state, and rivals.
+"""Registration of other groups' test cases, with each prior that a user can state, and rivals.
 
-The rival of point forces is a least-squares fit of all nodal forces within 30 mm of the true place,
-on full finite elements of another mesh than the truth's: the optimum that an adjoint method with a
-known zone descends to.
+The rival of point forces is a least-squares fit of all nodal forces within 30 mm of the true place.
+It uses full finite elements of another mesh than the truth's. An adjoint method with a known zone
+descends to this optimum.
 """
 
 from __future__ import annotations
@@ -36,7 +36,11 @@ _MILD = 1e-3  # prior displacement of the rival's nodal forces, over which it is
 
 @dataclass(frozen=True)
 class Prior:
-    """What a user says; label : its name in tables; rule : of the registration."""
+    """Prior knowledge of a user.
+
+    label : its name in tables
+    rule : rule of the registration
+    """
 
     label: str
     rule: RegistrationRule = field(default_factory=RegistrationRule)
@@ -71,7 +75,7 @@ PRIORS: dict[str, tuple[Prior, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """An answer to draw: place and interval of the surface's vertices [m], and the cloud [m]."""
+    """A result to draw: place and interval of the surface's vertices [m], and the cloud [m]."""
 
     place: FloatArray
     interval: FloatArray
@@ -79,7 +83,7 @@ class Shown:
 
 
 def other_rows(organ: SurfaceMesh, settings: RegistrationSettings) -> tuple[list[Row], Shown]:
-    """A row for each case and prior of an organ, and for each rival; the first case to draw."""
+    """Return a row for each case and prior of an organ, and for each rival; and a case to draw."""
     truth = Truth.on_small_clamp(tetrahedralize(organ, settings.n_true))
     vademecum = on_small_clamp(organ, truth, settings.n_vertices)
     rows: list[Row] = []
@@ -99,7 +103,7 @@ def _shown(vademecum: Vademecum, case: Case) -> Shown:
 
 
 def on_small_clamp(organ: SurfaceMesh, truth: Truth, n_vertices: int) -> Vademecum:
-    """Return the vademecum of an organ that is held where the truth is."""
+    """Return the vademecum of an organ that is held at the truth's clamp."""
     with TemporaryDirectory() as folder:
         groups = Path(folder, "groups.npz")
         np.savez(groups, allow_pickle=False, **truth.groups())
@@ -151,7 +155,7 @@ def answers(vademecum: Vademecum, case: Case, priors: tuple[Prior, ...]) -> list
 
 
 def in_zone(vademecum: Vademecum, case: Case) -> FloatArray:
-    """Where the vertices go by nodal forces within the zone, on full finite elements."""
+    """Return the vertices moved by nodal forces within the zone, on full finite elements."""
     mesh = vademecum.mesh
     elasticity = Elasticity(mesh, vademecum.material, vademecum.regions.clamped)
     on_surface = mesh.surface_vertices
@@ -169,7 +173,7 @@ def in_zone(vademecum: Vademecum, case: Case) -> FloatArray:
 
 
 def _errors(case: Case, place: FloatArray, seen: FloatArray) -> Row:
-    """Return the mean errors over the mean displacement, all, of what is seen, and of the rest."""
+    """Return mean errors over the mean displacement: all, seen and unseen vertices."""
     mean = float(case.volume @ np.linalg.norm(case.place - case.rest, axis=1))
     off = np.linalg.norm(place - case.place, axis=1)
     return {

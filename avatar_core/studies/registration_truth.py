@@ -1,13 +1,13 @@
 """True deformations of an organ, hyperelastic, and the clouds that show a part of them.
 
-Loads act on a neo-Hookean organ of another mesh than the vademecum's: several distributed pushes on
-the accessible surface, a pressure over a large patch, and what the vademecum's loads do not hold:
-pushes elsewhere, a support that moves and bends, a weight that turned. Some 30 % of the surface is
-seen from the front, with noise, moved rigidly by up to 10 mm and 10 degrees.
+Loads act on a neo-Hookean organ of another mesh than the vademecum's. They are several distributed
+pushes on the accessible surface, or a pressure over a large patch. Others are not among the
+vademecum's loads: pushes elsewhere, a support that moves and bends, a weight that turned. Some 30 %
+of the surface is seen from the front, with noise, moved rigidly by up to 10 mm and 10 degrees.
 
-Beyond these stand three that others measure by: a force at one place of an organ that hangs on a
-small clamp, up to 60 mm, linear or neo-Hookean, of which 20 % are seen without noise; packing, a
-wide pressure from behind; and a pneumoperitoneum, 1 to 2 kPa all over and a shift of 10 to 45 mm.
+Three more are test cases of other groups. A force acts at one place of an organ that hangs on a
+small clamp, up to 60 mm, linear or neo-Hookean; 20 % of it are seen without noise. Packing is a
+wide pressure from behind. A pneumoperitoneum is 1 to 2 kPa all over and a shift of 10 to 45 mm.
 """
 
 from __future__ import annotations
@@ -50,9 +50,11 @@ _MOST_ITERATIONS = 8  # of Newton's method in each
 class RegistrationSettings:
     """Sizes of the study.
 
-    n_vertices, n_true : of the vademecum's mesh and of the true one
-    n_cases : of each class; n_points : of a cloud
-    noise : of a point along each axis [m]; seen : part of the surface
+    n_vertices, n_true : sizes of the vademecum's mesh and of the true one
+    n_cases : number of cases of each class
+    n_points : number of points of a cloud
+    noise : noise of a point along each axis [m]
+    seen : visible fraction of the surface
     peak : least and largest displacement of the most displaced point, by small strains [m]
     """
 
@@ -68,13 +70,14 @@ class RegistrationSettings:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A true deformation and what is seen of it.
+    """A true deformation and the visible part of it.
 
-    rest, displacement, place : of the true mesh's vertices, the last in the cloud's frame,
-        shape (n, 3) [m]; volume : of each, summing to one
+    rest, displacement : ndarray, shape (n, 3), for the true mesh's vertices [m]
+    place : ndarray, shape (n, 3), places of the vertices in the cloud's frame [m]
+    volume : volume of each vertex, summing to one
     small_strains : displacement by the same loads at small strains, shape (n, 3) [m]
     cloud : Cloud
-    force_at : middle of the faces that are loaded, shape (3,) [m] at rest; None if all over
+    force_at : middle of the loaded faces, shape (3,) [m] at rest; None if all are loaded
     """
 
     rest: FloatArray
@@ -95,18 +98,18 @@ class Truth:
 
     @classmethod
     def of(cls, organ: SurfaceMesh, n_vertices: int) -> Truth:
-        """Of an organ, with the clamp of the anatomical rule."""
+        """Return the problem of an organ, with the clamp of the anatomical rule."""
         return cls.on(tetrahedralize(organ, n_vertices))
 
     @classmethod
     def on(cls, mesh: TetMesh) -> Truth:
-        """On a mesh, with the clamp of the anatomical rule."""
+        """Return the problem on a mesh, with the clamp of the anatomical rule."""
         regions = regions_by_rule(mesh)
         return cls(Hyperelasticity(mesh, NeoHookean(Material()), regions.clamped), regions)
 
     @classmethod
     def on_small_clamp(cls, mesh: TetMesh) -> Truth:
-        """Held by a disc in the middle of the usual clamp, and accessible everywhere else."""
+        """Return problem held by a disc in the middle of the usual clamp, accessible elsewhere."""
         usual = regions_by_rule(mesh).clamped
         centre = mesh.vertices[mesh.boundary_faces].mean(axis=1)
         off = np.linalg.norm(centre - centre[usual].mean(axis=0), axis=1)
@@ -157,7 +160,7 @@ class Truth:
         return Case(mesh.vertices, u, place, volume, small, Cloud(points), at)
 
     def _other_load(self, kind: str, rng: np.random.Generator) -> tuple[FloatArray, int | None]:
-        """Nodal forces (3 n_nodes, 1) of any size, and the face where they act, if at one."""
+        """Return nodal forces (3 n_nodes, 1) of any size, and the loaded face, if it is one."""
         mesh, free = self.mesh, np.flatnonzero(~self.regions.clamped)
         unit = mesh.face_area_normals / mesh.face_areas[:, None]
         if kind.startswith("point"):
@@ -200,7 +203,7 @@ class Truth:
     def _solved(
         self, kind: str, rng: np.random.Generator, peak: tuple[float, float]
     ) -> tuple[FloatArray, FloatArray]:
-        """Displacement of the vertices (n, 3) [m], and that of small strains, its peak as drawn."""
+        """Return vertex displacement (n, 3) [m], and that of small strains, its peak as drawn."""
         linear = self.elasticity
         load = np.zeros((3 * linear.n_nodes, 1))
         if kind == "moved support":
@@ -243,7 +246,8 @@ class Truth:
         return load
 
     def _pressure(self, rng: np.random.Generator, face: int | None) -> FloatArray:
-        """A constant pressure within 50 to 80 mm of a face, or all over: a third for each edge."""
+        """Return a constant pressure within 50 to 80 mm of a face, a third per edge, or all over.
+        """
         mesh = self.mesh
         centre = mesh.vertices[mesh.boundary_faces].mean(axis=1)
         unit = mesh.face_area_normals / mesh.face_areas[:, None]
@@ -259,7 +263,7 @@ class Truth:
         return load.reshape(-1, 1)
 
     def _support(self, rng: np.random.Generator) -> FloatArray:
-        """The clamp shifted along one direction, from nothing at one end to all at the other."""
+        """Return clamp's shift along one direction, from nothing at one end to all at the other."""
         held = self.regions.clamped
         corners = self.mesh.vertices[self.mesh.boundary_faces[held]]
         at = np.concatenate([corners, (corners + np.roll(corners, -1, axis=1)) / 2.0], axis=1)
@@ -272,7 +276,7 @@ class Truth:
 
 
 def _loaded(problem: Hyperelasticity, load: FloatArray) -> tuple[float, FloatArray]:
-    """Return the largest part of a dead load (3 n_nodes,) that has an equilibrium, and that."""
+    """Return the largest fraction of a dead load (3 n_nodes,) with an equilibrium, and that."""
     rule = NewtonRule(tolerance=1e-4, exact_stability=False)
     for part in _PARTS:
         try:
@@ -283,7 +287,7 @@ def _loaded(problem: Hyperelasticity, load: FloatArray) -> tuple[float, FloatArr
 
 
 def _moved_with_clamp(problem: Hyperelasticity, moved: FloatArray) -> FloatArray:
-    """Equilibrium with the clamp displaced as in ``moved`` (3 n_nodes,), that of small strains."""
+    """Return equilibrium at small strains with the clamp displaced as ``moved`` (3 n_nodes,)."""
     u = np.zeros_like(moved)
     for _ in range(_STEPS):
         u = _settled(problem, u + moved / _STEPS)

@@ -1,8 +1,9 @@
 """Finite element responses of an organ, and their interpolation through a grid.
 
-The paper stores displacements u(x, s) at the points of one grid common to all organs. Interpolated
-to the grid and back, u(x) ~ sum_c t_c(x) sum_k l_k(x_c) u_k, with barycentric coordinates l of the
-mesh at the grid points x_c (outside, those of the closest point) and trilinear weights t.
+The paper stores displacements u(x, s) at the points of one grid common to all organs. Interpolation
+to the grid and back gives u(x) ~ sum_c t_c(x) sum_k l_k(x_c) u_k. Here l are the barycentric
+coordinates of the mesh at the grid points x_c (outside, those of the closest point) and t trilinear
+weights.
 """
 
 from __future__ import annotations
@@ -25,12 +26,13 @@ BoolArray = NDArray[np.bool_]
 def unit_load_response(
     mesh: TetMesh, clamped: BoolArray, centers: FloatArray, radius: float
 ) -> FloatArray:
-    """Displacements under unit patch loads along x, y, z at each centre, with the default material.
+    """Return displacements under unit patch loads along x, y, z at each centre.
+
+    The material is the default one. The result has the shape (n_vertices, 3, 3 n) [m/N].
 
     clamped : ndarray of bool, shape (n_faces,), over mesh.boundary_faces
-    centers : ndarray, shape (n, 3) [m]; radius : of the patches [m]
-
-    Returns ndarray, shape (n_vertices, 3, 3 n) [m/N].
+    centers : ndarray, shape (n, 3) [m]
+    radius : radius of the patches [m]
     """
     elasticity = Elasticity(mesh, Material(), clamped)
     solution = elasticity.solve(patch_loads(elasticity, centers, radius))
@@ -47,18 +49,17 @@ def relative_errors(found: FloatArray, wanted: FloatArray, mesh: TetMesh) -> Flo
 
 
 def carried(matrix: sp.csr_matrix, field: FloatArray) -> FloatArray:
-    """A sparse map of shape (n, n_vertices) applied to a field of shape (n_vertices, 3, m)."""
+    """Apply a sparse map (n, n_vertices) to a field of shape (n_vertices, 3, m)."""
     return (matrix @ field.reshape(len(field), -1)).reshape(matrix.shape[0], *field.shape[1:])
 
 
 def trilinear(
     points: FloatArray, origin: FloatArray, spacing: float
 ) -> tuple[FloatArray, sp.csr_matrix]:
-    """Points of an infinite grid around some points, and the trilinear interpolation from them.
+    """Return points of an infinite grid around some points, and trilinear interpolation from them.
 
-    However fine the grid, only these are needed.
-
-    Returns corners, ndarray, shape (m, 3) [m], and a sparse matrix, shape (n, m).
+    However fine the grid, only these points are needed. Returns corners, ndarray, shape (m, 3) [m],
+    and a sparse matrix, shape (n, m).
     """
     place = (points - origin) / spacing
     cell = np.floor(place).astype(np.int64)

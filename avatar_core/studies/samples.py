@@ -1,9 +1,9 @@
 """Error against the number of anatomies (paper, Fig. 7), and time of LLE beside scikit-learn.
 
 A liver that is not in the base is interpolated from its twelve nearest of n livers of Eq. 17, n
-from 12 to 500; the error is that of the distance field within the organ. Times are from vectors of
-49,321 distances in memory to weights and embedding, with one thread for linear algebra in both
-programs.
+from 12 to 500. The error is that of the distance field within the organ. Times are from vectors of
+49,321 distances in memory to weights and embedding. Both programs use one thread for linear
+algebra.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ STUDY = SamplesStudy()
 
 
 def error_row(base: FloatArray, targets: FloatArray) -> Row:
-    """Return the error of the twelve nearest, of the nearest alone, and of LLE among all."""
+    """Return errors of the twelve nearest, of the nearest alone, and of LLE among all."""
     errors = {"error": NEIGHBORS, "nearest": 1, "all": min(len(base), 100)}
     row: Row = {"kind": "error", "n_samples": len(base)}
     for key, k in errors.items():
@@ -158,7 +158,7 @@ def _field_error(base: FloatArray, target: FloatArray, k: int) -> float:
 
 
 def time_lle(vectors: FloatArray, repeats: int) -> Timing:
-    """Return the weights and embedding of all vectors, ours and scikit-learn's in turn."""
+    """Time weights and embedding of all vectors, ours and scikit-learn's in turn."""
 
     def ours() -> LLE:
         base = LLE(NEIGHBORS, DIMENSION, regularization=TIMED_REGULARIZATION).fit(vectors)

@@ -81,7 +81,7 @@ def read_livers(folder: Path | None, n: int | None, phantoms: int) -> Livers:
 
 
 def read_liver(folder: Path | None, name: str) -> SurfaceMesh:
-    """One liver of a folder; the first one if none has that name, the phantom without a folder.
+    """Return one liver of a folder, else the first; the phantom without a folder.
 
     folder : None for ../shared/data/livers
     """
@@ -101,7 +101,7 @@ def subject_numbers(names: Sequence[str]) -> IntArray:
 
 
 def paper_box(surfaces: Sequence[SurfaceMesh], shape: tuple[int, int, int]) -> GridBox:
-    """Box around all surfaces with a number of points along each axis and equal spacing."""
+    """Return a box around all surfaces, with equal spacing and numbers of points by axis."""
     low = np.min([surface.bounding_box[0] for surface in surfaces], axis=0)
     high = np.max([surface.bounding_box[1] for surface in surfaces], axis=0)
     cells = np.array(shape) - 1

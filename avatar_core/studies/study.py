@@ -1,7 +1,7 @@
 """The frame of all studies: :class:`Study`, one :class:`Run` of it, its rows and its files.
 
-A study is a module of this package with an instance of :class:`Study`, ``STUDY``. It says what to
-measure and how to sum it up; folders, row files, tables, JSON and pictures are made here.
+A study is a module of this package with an instance of :class:`Study`, ``STUDY``. The study
+measures and sums up; folders, row files, tables, JSON and pictures are made here.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ PACKAGES = ("avatar", "numpy", "scipy", "libigl", "scikit-fem", "rslab", "scikit
 class Study(ABC, Generic[S]):
     """An experiment.
 
-    name : of the command and of the files it writes
+    name : name of the command and of the files it writes
     full, quick : its settings, and those of a smaller version that takes minutes
     paper : values of the paper, under the same keys as in the summary
     key : column that tells rows apart, by which an interrupted run goes on; empty: none does
@@ -60,7 +60,10 @@ class Study(ABC, Generic[S]):
 
     @abstractmethod
     def summary(self, run: Run[S]) -> dict[str, float]:
-        """Key figures: errors are fractions, times seconds, lengths have their unit in the key."""
+        """Return key figures: errors are fractions, times seconds.
+
+        Keys hold the unit of lengths.
+        """
 
     @abstractmethod
     def sentence(self, run: Run[S]) -> str:
@@ -75,9 +78,12 @@ class Study(ABC, Generic[S]):
 
         Parameters
         ----------
-        settings : such as ``full``
-        folder : to write to; it is made if it does not exist
-        surfaces : folder of liver surfaces [mm]; None for the default one
+        settings : S
+            Settings, e.g. ``full``.
+        folder : Path
+            Folder to write to; it is made if it does not exist.
+        surfaces : Path or None
+            Folder of liver surfaces [mm]; None for the default one.
         """
         folder.mkdir(parents=True, exist_ok=True)
         run = Run(self, settings, folder, surfaces)
@@ -88,12 +94,12 @@ class Study(ABC, Generic[S]):
 
 @dataclass(eq=False)
 class Run(Generic[S]):
-    """What a study was asked for and what it found.
+    """Inputs of a study and its findings.
 
     settings, folder, surfaces : as given to :meth:`Study.conduct`
     rows : one mapping per measurement
-    notices : what was skipped or done differently from the request, one line each
-    kept : what the summary or the picture needs beside the rows
+    notices : rows that were skipped or done differently from the request, one line each
+    kept : further data for the summary or the picture
     summary : key figures
     """
 
@@ -117,7 +123,7 @@ class Run(Generic[S]):
             self._file.add(row)
 
     def is_known(self, name: str) -> bool:
-        """Whether an interrupted run has measured this row, which is then taken from its file."""
+        """Return whether an interrupted run has measured this row; its file then holds it."""
         row = self._file.rows.get(name) if self._file is not None else None
         if row is not None:
             self.rows.append(row)
@@ -185,12 +191,12 @@ def machine() -> dict[str, Value]:
 
 
 class RowFile:
-    """Rows of a study as they are measured, one JSON object a line in ``NAME.rows.jsonl``.
+    """Rows of a study, one JSON object a line in ``NAME.rows.jsonl``, written when measured.
 
-    A study that is interrupted after an hour leaves what it had found, and goes on from there.
+    A study that is interrupted after an hour leaves its findings, and goes on from there.
 
-    path : of the file, which is begun if it is not there
-    key : by which rows are told apart
+    path : file, which is begun if it does not exist
+    key : column by which rows are told apart
     """
 
     def __init__(self, path: Path, key: str) -> None:
@@ -238,7 +244,7 @@ class Panel:
 
 
 def draw_panels(figure: Figure, panels: Sequence[Panel]) -> None:
-    """Panels in rows of three; the finding above them takes two inches."""
+    """Draw panels in rows of three; the finding above them takes two inches."""
     n_rows = -(-len(panels) // _IN_ROW)
     figure.set_size_inches(5.0 * _IN_ROW, 2.0 + 4.5 * n_rows)
     for k, panel in enumerate(panels):
@@ -278,7 +284,7 @@ class ProgressBar:
         self._bar.close()
 
     def begin(self, name: str) -> Progress:
-        """Begin a stage, which ends the one before; returns what its builds report to."""
+        """Begin a stage, which ends the one before; return the progress for its builds."""
         self._bar.update(1 if self._begun else 0)
         self._begun += 1
         self._bar.set_description_str(name)

@@ -1,10 +1,10 @@
 """Errors of a new patient's response from a base of real livers: three fidelities, leave-one-out.
 
 The reference is the full finite element solution for all accessible loads on the patient's mesh,
-with clamp and accessible region transferred from the template; errors are relative mass-weighted
-L2 norms of displacement, with the three directions of a load together. Other scans of the same
-person are left out. ``solved`` solves exactly these problems, so that its error is zero by
-construction; its time is that of all solutions, without their separation.
+with clamp and accessible region transferred from the template. Errors are relative mass-weighted L2
+norms of displacement, with the three directions of a load together. Other scans of the same person
+are left out. ``solved`` solves exactly these problems, so that its error is zero by construction.
+Its time is the time of all solutions, without their separation.
 """
 
 from __future__ import annotations
@@ -75,10 +75,10 @@ WEIGHTINGS: tuple[Weighting, ...] = ("lle-paper", "lle-grid", "lle-template", "k
 class TransportSettings:
     """Sizes of the study.
 
-    n_livers : of the atlas, at most; None for all
+    n_livers : largest number of livers of the atlas; None for all
     n_patients : livers of the atlas that are left out, one after another
-    n_vertices : of a patient's mesh
-    template_vertices, rank : of the atlas
+    n_vertices : size of a patient's mesh
+    template_vertices, rank : sizes of the atlas
     atlas : its name in the folder of the study, with which another run begins
     """
 
@@ -216,7 +216,7 @@ def _left_out(
     ridge: float,
     moved: np.ndarray,
 ) -> float:
-    """Return the mean error of a member from the others; those of the same person are left out."""
+    """Return a member's mean error from the others; those of the same person are left out."""
     out = sorted({*leave_one_out(base, base.names[i], SAME_SUBJECT), *base.copies})
     k = min(k, len(base.names) - len(out))
     if kind == "kriging":
@@ -261,14 +261,14 @@ def _patients(members: Sequence[SurfaceMesh], n: int) -> list[SurfaceMesh]:
 
 
 def transport_row(surface: SurfaceMesh, base: PatientBase, options: PatientOptions) -> Row:
-    """Return all fidelities of one patient against full finite elements.
+    """Measure all fidelities of one patient against full finite elements.
 
-    Errors are means over load positions unless they say worst. CPU seconds are those of
-    ``reduced`` after mesh and registration, and of its response alone, without what contact needs
-    around it; of everything from the surface to it, and from a file to a file, both without a
-    certificate; of all solutions with their factorization, to which the response alone compares.
-    ``clamp_rule`` is the error of solutions with the clamp of the anatomical rule,
-    ``template_missed`` the largest distance of the surface to the registered template [m].
+    Errors are means over load positions unless they say worst. CPU seconds are given for
+    ``reduced`` after mesh and registration, and for its response alone, without the preparation of
+    contact. Two further times are from the surface to ``reduced``, and from a file to a file, both
+    without a certificate. The time of all solutions with their factorization compares to the
+    response alone. ``clamp_rule`` is the error of solutions with the clamp of the anatomical rule.
+    ``template_missed`` is the largest distance of the surface to the registered template [m].
     """
     name = surface.name
     options = replace(options, leave_out=tuple(leave_one_out(base, name, SAME_SUBJECT)))

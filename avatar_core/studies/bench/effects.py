@@ -35,7 +35,7 @@ N_STEPS = 1500
 PUNCH = Tip("flat", SPHERE.radius)
 GRASPER = replace(SPHERE, grasp=Jaw(3e-3, 100.0))
 
-PULLED = 0.05  # part of a slide by which a jaw pulls what it holds
+PULLED = 0.05  # fraction of a slide by which a jaw pulls the tissue it holds
 LEAN = np.radians(20.0)  # of the punch off the surface where it sets out
 
 TWO_JAWS = "grasp, two jaws"
@@ -47,8 +47,8 @@ Case = tuple[str, int, tuple[Effect, ...]]  # name, tools, effects
 class EffectRow:
     """Step times of one scene.
 
-    p50_us, p99_us : medians over the rounds [us]; ratio : of p50 to the bare scene's in the same
-        rounds, their median
+    p50_us, p99_us : medians over the rounds [us]
+    ratio : median of p50 over the bare scene's in the same rounds
     contacts_mean : active contacts in the steps that were timed
     bytes : constant arrays of the model
     """
@@ -65,7 +65,7 @@ class EffectRow:
 def build_for_effects(
     surface: SurfaceMesh, n_vertices: int, modes: int, progress: Progress
 ) -> Vademecum:
-    """Return a vademecum of so many modes at most that serves all effects (minutes)."""
+    """Build a vademecum for all effects with a limited number of modes (minutes)."""
     linear = Organ.of(surface, n_vertices).linear(BuildRule(max_modes=modes), progress)
     problem = hyperelastic_problem(linear, "neo-hookean")
     return with_large_deformation(linear, problem, "neo-hookean", LargeRule(), progress)
@@ -76,7 +76,8 @@ def run_effects_bench(
 ) -> tuple[list[EffectRow], dict[str, float]]:
     """Return the rows and summary.
 
-    Everything at once leaves out what needs another tip, and what excludes large deformation.
+    The scene with everything leaves out effects that need another tip, or exclude large
+    deformation.
     """
     cases = cases_on(vademecum)
     apart = (Tilt.name, Tumour.name, Grasp.name, TWO_JAWS)
@@ -91,7 +92,7 @@ def run_effects_bench(
 
 
 def cases_on(vademecum: Vademecum) -> tuple[Case, ...]:
-    """A case for each effect that a vademecum serves, of one tool but where there must be two."""
+    """Return a case for each effect that a vademecum supports, with one tool where possible."""
     cases = []
     for name, kind in EFFECTS.items():
         effect = _leaning(vademecum) if kind is Tilt else kind.example()
@@ -153,7 +154,7 @@ def _row(
 
 
 def _slide(data: ContactData, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Times [us] and contacts of one slide over an organ at rest, of tools that do not turn."""
+    """Return times [us] and contacts of a slide over an organ at rest; tools do not turn."""
     data.reset()
     still = np.tile([0.0, 0.0, 0.0, 1.0], (data.model.n_tools, 1))
     jaws = np.ones(data.model.n_tools, bool) if data.grasps else None

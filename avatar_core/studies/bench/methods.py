@@ -46,9 +46,9 @@ TABLES: dict[Kind, str] = {np.float32: "dense table", np.int16: "dense table, 16
 class StepRow:
     """Step times of one method.
 
-    vertices : that are shown
-    p50_us, p99_us : of the whole step, contact and full field, medians over five slides [us]; NaN
-        if it does not fit
+    vertices : number of shown vertices
+    p50_us, p99_us : times of the whole step, contact and full field, medians over five slides [us];
+        NaN if it does not fit
     contacts_mean, contacts_min : active contacts in the steps that were timed
     """
 
@@ -64,14 +64,14 @@ class StepRow:
 
 
 def shown_cloud(vademecum: Vademecum) -> Cloud:
-    """What a step shows here: the displayed surface if there is one, or else all vertices."""
+    """Return the cloud that a step shows here: the displayed surface, or else all vertices."""
     return "volume" if vademecum.display is None else "surface"
 
 
 def time_steps(vademecum: Vademecum, n_tools: int, modes: int | None = None) -> StepRow:
     """Slide ``n_tools`` spheres of 10 mm, 5 mm deep, with the field at all shown vertices.
 
-    modes : that are shown at a place; None for all
+    modes : number of shown modes at a place; None for all
     """
     model = model_of(vademecum, (SPHERE,) * n_tools, modes, shown_cloud(vademecum))
     data = model.data()
@@ -81,9 +81,9 @@ def time_steps(vademecum: Vademecum, n_tools: int, modes: int | None = None) -> 
 def time_tip_over_patch(
     vademecum: Vademecum, modes: int, clock: Clock = time.process_time
 ) -> float:
-    """Median step with a sphere over that with the patch alone, whose response is all linear.
+    """Return the median step with a sphere over that with the patch alone, which is all linear.
 
-    Both slide in turn; the median over the pairs of slides.
+    Both slide in turn; the ratio is the median over the pairs of slides.
     """
     tips = tool_paths(vademecum, 1)
     models = [model_of(vademecum, (tip,), modes, cloud="volume") for tip in (SPHERE, PATCH)]
@@ -98,9 +98,9 @@ def time_tip_over_patch(
 def time_dense_table(
     vademecum: Vademecum, n_tools: int, clock: Clock = time.perf_counter, kind: Kind = np.float32
 ) -> StepRow:
-    """Return the same contacts and field from stored columns, displayed by the same interpolation.
+    """Time the same contacts and field from stored columns, with the same interpolation.
 
-    kind : of the stored numbers; in 16 bits each column has a factor of its own
+    kind : type of the stored numbers; in 16 bits each column has its own factor
     """
     cloud, name = shown_cloud(vademecum), TABLES[kind]
     n_v, n_s = POINTS * shown_blocks(vademecum, cloud), vademecum.surface.n_positions
@@ -116,9 +116,10 @@ def time_dense_table(
 def table_over_steps(
     vademecum: Vademecum, clock: Clock = time.process_time, kind: Kind = np.float32
 ) -> float:
-    """Return the median step of a dense table over that of the vademecum with all modes, one tool.
+    """Return the median step of a dense table over the vademecum's with all modes, one tool.
 
-    Both slide in turn, so that a machine that slows down slows both; the median over the pairs.
+    Both slide in turn, so that a machine that slows down slows both. The ratio is the median over
+    the pairs.
     """
     tips = tool_paths(vademecum, 1)
     data = model_of(vademecum, (SPHERE,), cloud=shown_cloud(vademecum)).data()
@@ -132,7 +133,7 @@ def table_over_steps(
 
 
 def _stepped(data: ContactData) -> Callable[[np.ndarray], object]:
-    """Return the step, of tools that do not turn."""
+    """Return the step as a function of tips, for tools that do not turn."""
     return lambda tips: step(data.model, data, tips)
 
 
@@ -166,7 +167,7 @@ def _stored(table: np.ndarray, kind: Kind) -> tuple[np.ndarray, np.ndarray]:
 def time_direct(
     elasticity: Elasticity, vademecum: Vademecum, n: int = 40, clock: Clock = time.perf_counter
 ) -> StepRow:
-    """Return one back-substitution with the stored factor per step, one contact."""
+    """Time one back-substitution with the stored factor per step, one contact."""
     surface = vademecum.surface
     loads = patch_loads(elasticity, surface.centers[:n], surface.patch_radius).toarray()
     elasticity.solve(loads[:, :1])
@@ -190,7 +191,7 @@ def time_direct(
 
 
 def load_average() -> float:
-    """Return the processes that compete for the machine, one-minute mean."""
+    """Return the number of processes that compete for the machine, one-minute mean."""
     return os.getloadavg()[0]
 
 
@@ -225,10 +226,10 @@ def one_pass(
     call: Callable[[np.ndarray], object],
     clock: Clock = time.perf_counter,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times [us] and contacts of the steps of one path in which all tools touch.
+    """Return the times [us] and contacts of a path's steps in which all tools touch.
 
     tips : ndarray, shape (n, n_tools, 3) [m]
-    clock : of the wall, or of the processor [s]
+    clock : wall or processor clock [s]
     """
     times = np.empty(len(tips))
     contacts = np.empty(len(tips), int)
@@ -246,7 +247,7 @@ def tool_paths(
 ) -> np.ndarray:
     """Return the slides of a tip at a depth [m] that start far apart, shape (n, n_tools, 3)."""
     starts = starts_apart(vademecum, n_tools)
-    if depth is None:  # a flat face that is found 5 mm inside may have been set there: not felt
+    if depth is None:  # a flat face that is found 5 mm inside may have been set there: no force
         depth = DEPTH if tip.offset > 0.0 else DEPTH / 2.0
     paths = [slide(vademecum, tip.offset, depth, n * 1e-4, position=start) for start in starts]
     return np.ascontiguousarray(np.stack(paths, axis=1))
@@ -265,7 +266,10 @@ def _columns(vademecum: Vademecum, cloud: Cloud) -> np.ndarray:
 
 
 def _compliance(vademecum: Vademecum) -> np.ndarray:
-    """Between all load positions, shape (n, 3, n, 3): position, direction, position, component."""
+    """Return the compliance between all load positions, shape (n, 3, n, 3).
+
+    The axes are position, direction, position, component.
+    """
     load, near = vademecum.contact_load, vademecum.contact_near
     n = vademecum.surface.n_positions
     dense = (load @ load.T).reshape(n, 3, n, 3)
@@ -277,7 +281,7 @@ def _compliance(vademecum: Vademecum) -> np.ndarray:
 
 @compiled(fastmath=True)
 def _dense_step(model, data, columns, size, compliance, softness):  # type: ignore[no-untyped-def]
-    """:func:`avatar_core.contact.model.step` with stored columns instead of modes."""
+    """Step like :func:`avatar_core.contact.model.step`, with stored columns instead of modes."""
     for t in range(data.tip.shape[0]):
         locate(model, data, t, data.tip[t])
         data.mode[t] = np.float32(0.0)

@@ -27,11 +27,11 @@ Waiting = Callable[[str], AbstractContextManager[object]]
 class StepCost:
     """The step of one scene.
 
-    p50_us, p99_us : of the whole step, forces and cloud, medians over the passes [us]; NaN if the
-        tools never touch at once
-    n_steps : timed, those in which all tools touch
-    bytes : of the model
-    layout_seconds : what it takes to lay out
+    p50_us, p99_us : times of the whole step, forces and cloud, medians over the passes [us]; NaN if
+        the tools never touch at once
+    n_steps : number of timed steps, those in which all tools touch
+    bytes : size of the model
+    layout_seconds : time to lay out the model
     """
 
     name: str
@@ -45,15 +45,18 @@ class StepCost:
 def time_scene(
     vademecum: Vademecum, scene: Scene, waiting: Waiting = lambda text: nullcontext()
 ) -> tuple[StepCost, ...]:
-    """The bare step, of the first tool without any effect, and the scene's own, pass by pass.
+    """Time the bare step, of the first tool without any effect, and the scene's own, in turn.
 
     The tools push 10 mm deep, then slide 5 mm deep; with a breath they follow the organ.
 
     Parameters
     ----------
-    vademecum : Vademecum, of which ``scene.require`` has approved
-    scene : Scene; one that is bare is timed once
-    waiting : entered with a text for what takes long
+    vademecum : Vademecum
+        Vademecum that ``scene.require`` accepts.
+    scene : Scene
+        Scene; a bare scene is timed once.
+    waiting : Waiting
+        Context manager, entered with a text during long work.
     """
     bare = replace(scene, tools=scene.tools[:1], effects=())
     chosen = {"bare": bare, "scene": scene}
@@ -72,7 +75,7 @@ def time_scene(
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """Data of a model and the ways of its tools, shape (n, n_tools, 3)."""
+    """Data of a model and the paths of its tools, shape (n, n_tools, 3)."""
 
     name: str
     data: ContactData
@@ -113,7 +116,7 @@ def _prepared(vademecum: Vademecum, scene: Scene, name: str) -> _Prepared:
 
 
 def _followed(data: ContactData, tips: np.ndarray) -> np.ndarray:
-    """Return the same ways on an organ that breathes: where it is in each period, from rest."""
+    """Return the same paths on an organ that breathes: its place in each period, from rest."""
     respiration = data.state.respiration
     if respiration is None:
         return tips

@@ -31,8 +31,8 @@ def run_step_bench(
 ) -> tuple[list[StepRow], dict[str, float]]:
     """Return the rows of the table and the summary.
 
-    n_vertices : of the mesh, all of which are shown; then its surface at each number of
-        ``displayed`` vertices
+    n_vertices : size of the mesh, all of whose vertices are shown; then its surface is shown at
+        each number of ``displayed`` vertices
     """
     progress("mesh", 0.0, NO_ERROR)
     meshed = Organ.of(surface, n_vertices)
@@ -50,7 +50,7 @@ def run_step_bench(
 
 
 def time_organ(organ: Vademecum) -> tuple[list[StepRow], dict[str, float]]:
-    """Return the rows and summary of a vademecum as it is."""
+    """Return the rows and summary of an existing vademecum."""
     rows = _rows(organ, (*MODES, organ.n_modes))
     return rows, {
         "tip_over_patch": time_tip_over_patch(organ, organ.n_modes),
@@ -63,7 +63,7 @@ def time_organ(organ: Vademecum) -> tuple[list[StepRow], dict[str, float]]:
 
 
 def _rows(vademecum: Vademecum, modes: Sequence[int]) -> list[StepRow]:
-    """Return a vademecum with so many modes and dense tables, with one tool and with several."""
+    """Time a vademecum with some numbers of modes and dense tables, with one tool and several."""
     rows: list[StepRow] = []
     for n_tools in (1, N_TOOLS):
         rows += [time_steps(vademecum, n_tools, some) for some in modes]
