@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 atlas = typer.Typer(
     help="Build and inspect atlases: known organs from which patients are made.",
     no_args_is_help=True,
-    rich_markup_mode=None,  # which takes units, such as [m], for markup
+    rich_markup_mode=None,  # markup would remove units like [m]
 )
 
 AtlasFolder = Annotated[Path, typer.Argument(metavar="ATLAS", help="folder of the atlas")]
@@ -96,7 +96,7 @@ def add(
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Add surfaces to an atlas. Nothing that is there is computed or written again.
+    """Add surfaces to an atlas. Existing members are neither computed nor written again.
 
     To remove an organ, delete its folder. Exit code 1: no surface could be used.
     """
@@ -120,7 +120,7 @@ def show(folder: AtlasFolder, as_json: AsJson = False) -> None:
 
 
 def summary(atlas: Atlas, nbytes: int) -> dict[str, Any]:
-    """What ``avatar atlas show --json`` prints; lengths in metres, volumes in m3."""
+    """Return the data of ``avatar atlas show --json``; lengths in metres, volumes in m3."""
     copies = {one.name: one.of for one in atlas.duplicates}
     frame = atlas.frame
     return {
@@ -189,7 +189,7 @@ def _grown(
     jobs: int | None,
     scheduler: str | None,
 ) -> Growth:
-    """Return the atlas after its growth; says after Ctrl-C how to go on."""
+    """Return the atlas after its growth; after Ctrl-C, print how to go on."""
     from avatar_core.atlas.response import ResponseSolver
     from avatar_core.atlas.workers import Workers
 
@@ -204,7 +204,7 @@ def _grown(
 
 
 def _report(folder: Path, growth: Growth) -> None:
-    """Print what was added and skipped; raises AvatarError if no surface could be used."""
+    """Print added and skipped surfaces; raise AvatarError if no surface could be used."""
     for one in growth.skipped:
         print(f"skipped: {one.name}: {one.reason.removeprefix(f'{one.name}: ')}", file=sys.stderr)
     say_notices(growth.notices)
@@ -221,7 +221,7 @@ def _report(folder: Path, growth: Growth) -> None:
 def _sources(
     surfaces: Sequence[str], unit: str, axes: str | None, label: str | None
 ) -> list[Source]:
-    """Return the surfaces named, those of a folder in the order of their names."""
+    """Return the named surfaces, and those of a folder in the order of their names."""
     from avatar_core.atlas.growth import SurfaceFile
     from avatar_core.geometry.phantom import phantom_liver
     from avatar_core.geometry.surface import METRES, axes_matrix

@@ -1,4 +1,4 @@
-"""``avatar bench step | effects | cell | start | idle``: whether this machine holds 1 kHz."""
+"""``avatar bench step | effects | cell | start | idle``: check whether this machine holds 1 kHz."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 bench = typer.Typer(
     help="Measure whether this machine holds 1 kHz.",
     no_args_is_help=True,
-    rich_markup_mode=None,  # which takes units, such as [m], for markup
+    rich_markup_mode=None,  # markup would remove units like [m]
 )
 
 SurfaceOrVademecum = Annotated[
@@ -50,15 +50,15 @@ def bench_step(
     displayed: Annotated[
         list[int] | None,
         typer.Option(
-            help="approximate vertices of a displayed surface, may be repeated; 0: none; "
-            "default: 20000 and 100000"
+            help="approximate number of vertices of a displayed surface; 0: none; may be "
+            "repeated; default: 20000 and 100000"
         ),
     ] = None,
     output: Json = None,
 ) -> None:
     """Time the contact step, a dense table and a direct solve (building takes a minute).
 
-    For a vademecum (.h5): the step with what it shows, and a dense table.
+    For a vademecum (.h5): the step with its own displayed surface, and a dense table.
     """
     from avatar_core.geometry.resampling import require_displayable
     from avatar_core.studies.bench.methods import load_average
@@ -96,12 +96,12 @@ def bench_effects(
     axes: Axes = None,
     label: Label = None,
     vertices: Vertices = 2850,
-    modes: Annotated[int, typer.Option(help="modes at a place at most")] = 100,
+    modes: Annotated[int, typer.Option(help="largest number of modes at a place")] = 100,
     output: Json = None,
 ) -> None:
     """Time the step without effects, with each one, and with all (building takes minutes).
 
-    For a vademecum (.h5): with those that it can serve.
+    For a vademecum (.h5): with the effects that it supports.
     """
     from avatar_core.studies.bench.effects import build_for_effects, run_effects_bench
     from avatar_core.studies.bench.methods import load_average
@@ -132,7 +132,7 @@ def bench_effects(
 
 
 def _compile() -> None:
-    """Say what a first start waits for."""
+    """Compile the step, with a message if it takes long."""
     from avatar_core.contact.model import compiled_step
 
     with waiting("compiling the step, once on this machine"):
@@ -154,13 +154,13 @@ def bench_cell(
     seconds: Annotated[float, typer.Option(help="duration of each run [s]")] = 60.0,
     vertices: Vertices = 2850,
     changes: Annotated[
-        float, typer.Option(help="rate at which the material is changed meanwhile [Hz]")
+        float, typer.Option(help="rate of material changes during the run [Hz]")
     ] = 0.0,
     output: Json = None,
 ) -> None:
     """Time the whole ROS 2 cell: tool, contact and cloud subscriber as separate processes.
 
-    Also reports whether memory, open files or threads of a process keep growing; run it with
+    Also reports whether memory, open files or threads of a process keep growing. Run it with
     --seconds 600 for a soak test.
     """
     import tempfile
@@ -199,18 +199,19 @@ def bench_start(
 
 @bench.command("idle")
 def bench_idle(
-    seconds: Annotated[float, typer.Option(help="to measure [s]")] = 20.0,
+    seconds: Annotated[float, typer.Option(help="duration of the measurement [s]")] = 20.0,
     atlas: Annotated[
         Path | None,
         typer.Option(
             exists=True,
             dir_okay=False,
-            help="atlas of the patients' service; without one it is started, not configured",
+            help="atlas for the service that builds patients; without one the service "
+            "starts, but is not configured",
         ),
     ] = None,
     output: Json = None,
 ) -> None:
-    """Print what each thread of the nodes takes of a processor while there is nothing to do."""
+    """Print the processor use of each thread of the nodes while there is nothing to do."""
     require_ros()
     _require_json(output, atlas)
     options = ["--atlas", str(atlas.resolve())] if atlas is not None else []
@@ -250,7 +251,7 @@ def run_cell(
 
 
 def _run_module(name: str, arguments: list[str], output: Path | None) -> None:
-    """Run a benchmark of avatar_ros; its exit code is ours if it fails."""
+    """Run a benchmark of avatar_ros; pass on its exit code if it fails."""
     command = [sys.executable, "-m", f"avatar_ros.bench.{name}", *arguments]
     command += ["--output", str(output)] if output is not None else []
     sys.stdout.flush()  # keeps the order of output in a file

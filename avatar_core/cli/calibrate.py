@@ -37,21 +37,24 @@ def calibrate(
     given: Annotated[
         list[str] | None,
         typer.Option(
-            help="what is known before, as of 'avatar uncertainty'; default: anything within the "
+            help="prior knowledge of a parameter, as in 'avatar uncertainty', e.g. "
+            "young=lognormal:5300:1.5; may be repeated; default: anything within the "
             "ranges of the vademecum, and a Young's modulus of 500 to 350,000 Pa"
         ),
     ] = None,
     tool: Annotated[
         str | None,
         typer.Option(
-            help="of a bag of several tools: NAME of the topics NAME/measured_cp; of a recording: "
-            "number of the tool, from 1"
+            help="for a bag of several tools: NAME in the topics NAME/measured_cp; for a "
+            "recording: number of the tool, from 1"
         ),
     ] = None,
     tool_transform: ToolTransform = None,
-    radius: Annotated[float, typer.Option(help="of a bag: radius of the spherical tip [mm]")] = 5.0,
+    radius: Annotated[
+        float, typer.Option(help="for a bag: radius of the spherical tip [mm]")
+    ] = 5.0,
     sensor: Annotated[
-        float, typer.Option(help="standard deviation of a measured force, a part of it")
+        float, typer.Option(help="standard deviation of a measured force over the force [-]")
     ] = 0.02,
     least: Annotated[
         float, typer.Option(help="smallest standard deviation of a measured force [N]")
@@ -59,15 +62,15 @@ def calibrate(
     depth: Annotated[
         float,
         typer.Option(
-            help="standard deviation of the place of the surface at a touch [mm]: of the mesh and "
-            "of the registration of tool and organ"
+            help="standard deviation of the surface's place at a touch [mm], by the mesh and "
+            "the registration of tool and organ"
         ),
     ] = 0.3,
     extent: Annotated[
         float,
         typer.Option(
-            help="standard deviation by what the mesh makes of a tumour's or a support's extent, a "
-            "part of contrast and stiffness"
+            help="relative standard deviation of contrast and support stiffness [-], because "
+            "the mesh changes the extent of a tumour or support"
         ),
     ] = 0.2,
     output: Annotated[
@@ -80,7 +83,7 @@ def calibrate(
         ),
     ] = None,
     set_them: Annotated[
-        bool, typer.Option("--set", help="set the values in the contact node that runs")
+        bool, typer.Option("--set", help="set the values in the running contact node")
     ] = False,
 ) -> None:
     """Find Young's modulus and the coordinates of a vademecum from touches with measured forces."""
@@ -92,10 +95,10 @@ def calibrate(
 
     for one in output or []:
         require_output(one, _FORMATS, [file, recording])
-    require(0.0 < sensor < 1.0, f"--sensor is {sensor}; give a part of the force, such as 0.02")
+    require(0.0 < sensor < 1.0, f"--sensor is {sensor}; give a fraction of the force, e.g. 0.02")
     require(least > 0.0, f"--least is {least} N; give a positive force")
     require(0.0 <= depth <= 20.0, f"--depth is {depth} mm; give 0 to 20")
-    require(0.0 <= extent <= 1.0, f"--extent is {extent}; give a part of the value, 0 to 1")
+    require(0.0 <= extent <= 1.0, f"--extent is {extent}; give a fraction of the value, 0 to 1")
     if set_them:
         require_ros()
     known = given_of(given or [])

@@ -20,9 +20,9 @@ from avatar_core.errors import AvatarError
 _AGAIN = 1.0  # after which a cell that has not ended is interrupted again [s]
 
 Host = Annotated[
-    str, typer.Option(help="network address to serve the page on; 0.0.0.0: all, without TLS")
+    str, typer.Option(help="network address of the page; 0.0.0.0: all interfaces, without TLS")
 ]
-Port = Annotated[int, typer.Option(help="port of the page; if it is taken, the next free one")]
+Port = Annotated[int, typer.Option(help="port of the page, or the next free one")]
 
 
 def cell(
@@ -31,25 +31,30 @@ def cell(
         typer.Option(
             exists=True,
             dir_okay=False,
-            help="parameters of all nodes (YAML), such as params/planning_cell.yaml",
+            help="parameters of all nodes (YAML), e.g. params/planning_cell.yaml",
         ),
     ] = None,
     library_dir: Annotated[
         Path | None, typer.Option(exists=True, file_okay=False, help="folder of the vademecums")
     ] = None,
-    vademecum: Annotated[str, typer.Option(help="file in that folder to load")] = "",
+    vademecum: Annotated[str, typer.Option(help="vademecum to load, a file in --library-dir")] = "",
     atlas: Annotated[
         Path | None,
         typer.Option(
-            exists=True, file_okay=False, help="atlas for the node that builds patients, a folder"
+            exists=True,
+            file_okay=False,
+            help="folder of the atlas, for the node that builds patients",
         ),
     ] = None,
     tools: Annotated[
-        str, typer.Option(help="names of the tools, as left,right; default: one, tool")
+        str, typer.Option(help="names of the tools, e.g. left,right; default: one tool, named tool")
     ] = "",
     scene: Annotated[
         str,
-        typer.Option(help="scene to simulate, of as many tools: name of a shipped one, or a path"),
+        typer.Option(
+            help="scene to simulate, with as many tools as --tools: name of a "
+            "shipped scene, or a path"
+        ),
     ] = "",
     state_dir: Annotated[
         Path | None,
@@ -65,9 +70,9 @@ def cell(
 ) -> None:
     """Run the loader, the contact node and, with an atlas, the patient node, until Ctrl-C.
 
-    Options override the parameter file; without either, the library is the current folder. A node
-    that dies is started again; one that refuses to start, or is told to end, ends all. Otherwise
-    as `ros2 launch avatar_ros planning_cell.launch.py`.
+    Options override the parameter file. Without both, the library is the current folder. A node
+    that dies is started again. A node that refuses to start, or is told to end, ends all. In other
+    respects the command equals `ros2 launch avatar_ros planning_cell.launch.py`.
     """
     require_ros()
     page = {"host": host, "port": str(port)} if ui else {}

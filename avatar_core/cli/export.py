@@ -1,6 +1,4 @@
-"""``avatar export``: a vademecum as a mesh for ParaView, or as deformed surfaces for 3D Slicer; a
-recording as MCAP.
-"""
+"""``avatar export``: a vademecum for ParaView or 3D Slicer, or a recording as MCAP."""
 
 from __future__ import annotations
 
@@ -35,24 +33,25 @@ def export(
     at: Annotated[
         str | None,
         typer.Option(
-            help="point of the load [m], such as 0,0.07,0.005; default: middle of the accessible "
-            "surface"
+            help="point of the load [m], e.g. 0,0.07,0.005; default: middle of the "
+            "accessible surface"
         ),
     ] = None,
     force: Annotated[
         str,
         typer.Option(
-            help="load [N]: one number, inward along the normal, or a vector such as 0,-1,0.5"
+            help="load [N]: one number, inward along the normal, or a vector, e.g. 0,-1,0.5"
         ),
     ] = "1",
     modes: Annotated[int, typer.Option(help="number of global modes to write")] = 10,
-    unit: Annotated[str, typer.Option(help="of surfaces: mm, cm or m")] = "mm",
+    unit: Annotated[str, typer.Option(help="unit of surfaces: mm, cm or m")] = "mm",
     axes: Annotated[
-        str, typer.Option(help="of surfaces: LPS or RAS, which the header states")
+        str, typer.Option(help="axes of surfaces: LPS or RAS, stated in the file's header")
     ] = "LPS",
 ) -> None:
-    """Export an organ under a load: a mesh for ParaView, or deformed surfaces for 3D Slicer. Export
-    a recording as MCAP.
+    """Export an organ under a load for ParaView or 3D Slicer, or a recording as MCAP.
+
+    The suffix of the output chooses: a mesh, deformed surfaces, or a bag of ROS 2.
     """
     from avatar_core.bags.files import MCAP
     from avatar_core.contact.tool_path import middle_of_access
@@ -68,8 +67,8 @@ def export(
     if output.suffix == MCAP:
         _export_recording(file, output)
         return
-    newtons = numbers("--force", force, (1, 3), "one number or three, as 0,-1,0.5")
-    given = None if at is None else numbers("--at", at, (3,), "three numbers, as 0,0.07,0.005")
+    newtons = numbers("--force", force, (1, 3), "one number or three, e.g. 0,-1,0.5")
+    given = None if at is None else numbers("--at", at, (3,), "three numbers, e.g. 0,0.07,0.005")
     vademecum = load_vademecum(file)
     point = vademecum.surface.centers[middle_of_access(vademecum)] if given is None else given
     if output.suffix in FORMATS:
@@ -99,14 +98,14 @@ def _export_recording(file: Path, output: Path) -> None:
 
 
 def _say_load(vademecum: Vademecum, point: Any, newtons: list[float], moved: float) -> None:
-    """The load, the largest displacement [m], and what is known of its error."""
+    """Print the load, the largest displacement [m], and its known error."""
     from avatar_core.geometry.tip import MAX_DEPTH
 
     place = vademecum.surface.nearest(point)
     x, y, z = place.point
     newton = sum(number * number for number in newtons) ** 0.5
     certificate = vademecum.certificate
-    known = f", {certificate.l2_mean:.1%} off in the mean" if certificate else ", of unknown error"
+    known = f", {certificate.l2_mean:.1%} mean error" if certificate else ", of unknown error"
     print(
         f"{newton:g} N at ({x:.4f}, {y:.4f}, {z:.4f}) m move it by {1e3 * moved:.2f} mm at "
         f"most{known}"

@@ -28,7 +28,7 @@ app = typer.Typer(
     help="Computational patient avatars: compute the mechanical response of an organ once, and "
     "evaluate it at 1 kHz.",
     no_args_is_help=True,
-    rich_markup_mode=None,  # which takes units, such as [m], for markup
+    rich_markup_mode=None,  # markup would remove units like [m]
     pretty_exceptions_enable=False,
     add_completion=False,
 )
@@ -48,7 +48,7 @@ app.command()(cell)
 
 
 def main() -> int:
-    """Return the entry point: errors of the input become one line and exit code 1."""
+    """Run the command; errors of the input become one line and exit code 1."""
     try:
         code = app(standalone_mode=False)
     except AvatarError as error:

@@ -11,8 +11,8 @@ from avatar_core.errors import AvatarError
 ToolTransform = Annotated[
     str | None,
     typer.Option(
-        help="of a bag: pose of the poses' frame in the organ's, x,y,z [m] and quaternion "
-        "x,y,z,w, as the node's parameter tool_transform"
+        help="for a bag: pose of the poses' frame in the organ's frame, x,y,z [m] and "
+        "quaternion x,y,z,w, like the node's parameter tool_transform"
     ),
 ]
 

@@ -1,4 +1,4 @@
-"""Where a command may write its result: refused before anything is computed."""
+"""Checks of a command's output file, before anything is computed."""
 
 from __future__ import annotations
 
@@ -30,11 +30,17 @@ def require_output(
 
     Parameters
     ----------
-    output : file to write
-    suffixes : in which its name may end
-    inputs : files that are read; never replaced, whatever the name or link that leads to them
-    replaces : whether a file that is there may be replaced; None: any file of that suffix
-    overwrite : replace any file but an input
+    output : Path
+        File to write.
+    suffixes : Iterable[str]
+        Allowed ends of its name.
+    inputs : Iterable[str or Path or None]
+        Files that are read. They are never replaced, whatever name or link leads to them.
+    replaces : Callable[[Path], bool] or None
+        Function that returns whether an existing file may be replaced; None: any file of that
+        suffix.
+    overwrite : bool
+        Replace any file but an input.
     """
     suffixes = tuple(suffixes)
     if output.suffix not in suffixes:

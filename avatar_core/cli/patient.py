@@ -40,8 +40,9 @@ def patient(
     fidelity: Annotated[
         str,
         typer.Option(
-            help="interpolated: from the responses of known organs, in seconds; reduced: solved on "
-            "the patient's own mesh in a space that these span; solved: full finite elements"
+            help="interpolated: from the responses of known organs, in seconds; reduced: "
+            "solved on the patient's own mesh, in a space spanned by these responses; "
+            "solved: full finite elements"
         ),
     ] = "reduced",
     tolerance: Annotated[
@@ -51,20 +52,20 @@ def patient(
     weighting: Annotated[
         str,
         typer.Option(
-            help="how known organs are weighted: kriging or lle-template, on the registered "
+            help="weights of known organs: kriging or lle-template, on the registered "
             "template; lle-grid, on level sets; or lle-paper, as in the paper"
         ),
     ] = "kriging",
     neighbors: Annotated[
         int | None,
         typer.Option(
-            help="number of known organs that are used; default: 64 at "
-            "most, 40 with lle-template, 10 with lle-paper"
+            help="number of known organs in use; default: at most 64, or 40 with "
+            "lle-template, 10 with lle-paper"
         ),
     ] = None,
     leave_out: Annotated[
         list[str] | None,
-        typer.Option(help="name of a known organ that is not used; may be repeated"),
+        typer.Option(help="name of a known organ that gets no weight; may be repeated"),
     ] = None,
     unit: Unit = "mm",
     axes: Axes = None,
@@ -72,7 +73,7 @@ def patient(
     groups: Groups = None,
     support: Supports = None,
     vertices: Vertices = 2850,
-    modes: Annotated[int, typer.Option(help="maximum number of modes at a place")] = 100,
+    modes: Annotated[int, typer.Option(help="largest number of modes at a place")] = 100,
     certify: Annotated[
         int | None,
         typer.Option(

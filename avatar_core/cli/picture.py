@@ -26,14 +26,10 @@ RESOLVED = (1e-3, 2e-3, 3e-3, 4e-3, 5e-3)  # depths at which contact is resolved
 class ForceCurve:
     """Normal forces on ``TIP`` at one place, over its depth.
 
-    half-space [N]; resolved : (len(RESOLVED),) of resolved contact [N], None where there is none
-
-    Attributes
-    ----------
-    depth : ndarray
-        (n,) [m].
-    force, error, hertz : ndarray
-        (n,) of the step, its error as it is said, and of a.
+    depth : ndarray, shape (n,) [m]
+    force, error, hertz : ndarray, shape (n,), of the step, its estimated error, and of a half-space
+        [N]
+    resolved : ndarray, shape (len(RESOLVED),), of resolved contact [N]; None without one
     """
 
     depth: np.ndarray
@@ -58,12 +54,16 @@ def palpation_picture(
     """Draw the organ under a push in the middle of its accessible surface, and the force there.
 
     Left: deformed boundary seen from the front, coloured by displacement. Right: normal force over
-    depth by the 1 kHz step, on a half-space (Hertz 1882), and of resolved contact.
+    depth by the 1 kHz step, on a half-space (Hertz 1882), and by resolved contact.
 
     Parameters
     ----------
-    surface : that the vademecum was built of
-    progress : is told which part of the resolved contact is done
+    vademecum : Vademecum
+    surface : SurfaceMesh
+        Surface that the vademecum was built from.
+    path : str or Path
+    progress : Callable[[float], None] or None
+        Called with the finished fraction of the resolved contact.
     """
     import matplotlib
 

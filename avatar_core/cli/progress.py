@@ -31,7 +31,7 @@ _PER_SITE = 0.4  # of a place of contacts, over all else
 
 @contextmanager
 def progress_bar(unit: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar that appears after ``_FROM`` seconds; told how many are done and how many there are."""
+    """Show a bar after ``_FROM`` seconds; yield a function of the numbers of done and all items."""
     with _bar(unit=f" {unit}", delay=_FROM, leave=False) as bar:
 
         def show(done: int, total: int) -> None:
@@ -43,9 +43,9 @@ def progress_bar(unit: str) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def stage_bar(stages: dict[str, float] | None = None) -> Iterator[Progress]:
-    """A bar that is told stage, completed fraction, and error (NaN: unknown).
+    """Show a bar of stages; yield a function of stage, fraction, and error (NaN: unknown).
 
-    stages : part of each stage of the whole, in their order; None: fractions are of the whole
+    stages : fraction of each stage of the whole, in their order; None: fractions are of the whole
     """
     with _bar(total=1.0, bar_format="{desc:36s} {percentage:3.0f}% |{bar}| {elapsed}") as bar:
 
@@ -59,7 +59,7 @@ def stage_bar(stages: dict[str, float] | None = None) -> Iterator[Progress]:
 
 
 def build_stages(large: bool = False, contact_sites: int = 0) -> dict[str, float]:
-    """Return the stages of a build, ``contact_sites`` among them or none."""
+    """Return the stages of a build, with or without ``contact_sites``."""
     total = 1.0 + _PER_SITE * contact_sites
     *first, last = ((name, part / total) for name, part in (_LARGE if large else _LINEAR).items())
     return dict([*first, ("contacts", 1.0 - 1.0 / total), last])
@@ -73,7 +73,7 @@ def _reached(stages: dict[str, float], stage: str, fraction: float) -> float:
 
 @contextmanager
 def item_bar(total: int) -> Iterator[Callable[[int, int, str], None]]:
-    """A bar over so many things; told how many are done, their number and the name of one."""
+    """Show a bar of items; yield a function of the number done, an item's number and its name."""
     layout = "{desc:16.16s} {n_fmt}/{total_fmt} |{bar}| {elapsed}<{remaining}"
     with _bar(total=total, bar_format=layout) as bar:
 

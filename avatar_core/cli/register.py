@@ -1,4 +1,4 @@
-"""``avatar register``: an organ where a cloud of points shows it, with what is not known of it."""
+"""``avatar register``: an organ at a cloud of points, with the uncertainty of its displacement."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ FRAMES = ("camera", "known")
 KINDS = ("smooth", "few", "pressure")
 LARGE = 0.01  # displacement from which small strains are spoken of [m]
 HELP = (
-    "what would help: a known frame (--frame known), where the tool presses (--forces near), a "
-    "second view"
+    "a known frame (--frame known), the place where the tool presses (--forces near) or a "
+    "second view would help"
 )
 
 
@@ -54,56 +54,62 @@ def register(
     unit: Unit = "mm",
     axes: Axes = None,
     noise: Annotated[
-        float, typer.Option(help="standard deviation of the points along the normal, about [m]")
+        float,
+        typer.Option(help="approximate standard deviation of the points along the normal [m]"),
     ] = 1e-3,
     correlation: Annotated[
-        float, typer.Option(help="length over which errors are alike, as of a stereo camera [m]")
+        float,
+        typer.Option(
+            help="length over which errors of the points are correlated [m], "
+            "e.g. of a stereo camera; 0: not correlated"
+        ),
     ] = 0.0,
     frame: Annotated[
         str,
         typer.Option(
-            help="camera: the organ may have moved rigidly, by about --shift and --turn; known: "
-            "it deformed alone, and the cloud is in its own frame"
+            help="camera: the organ may have moved rigidly, by about --shift and --turn; "
+            "known: the organ only deformed, and the cloud is in its frame"
         ),
     ] = "camera",
     shift: Annotated[float, typer.Option(help="root mean square of a rigid shift [m]")] = 0.01,
     turn: Annotated[float, typer.Option(help="root mean square of a rigid turn [degrees]")] = 10.0,
     support_shift: Annotated[
-        float,
-        typer.Option(help="by how much each support of the vademecum may have moved, about [m]"),
+        float, typer.Option(help="approximate motion of each support of the vademecum [m]")
     ] = 0.0,
     kind: Annotated[
         str | None,
         typer.Option(
-            help="what deformed the organ: smooth (tractions all over), few (forces at up to three "
-            "places, as tools make them), pressure; default: smooth or few, whichever predicts "
-            "patches of the cloud that are left out"
+            help="kind of loads that deformed the organ: smooth (tractions all over), few "
+            "(forces at up to three places, e.g. by tools) or pressure; default: smooth "
+            "or few, whichever better predicts patches left out of the cloud"
         ),
     ] = None,
     forces: Annotated[
         str,
         typer.Option(
-            help="where forces may act: accessible, seen, or near X,Y,Z,RADIUS at rest [m], as of "
-            "a tool that is tracked"
+            help="places where forces may act: accessible, seen, or near X,Y,Z,RADIUS at "
+            "rest [m], e.g. for a tracked tool"
         ),
     ] = "accessible",
     within: Annotated[
         float,
-        typer.Option(help="a place is determined if its 90 % interval is no wider to a side [m]"),
+        typer.Option(
+            help="largest half-width [m] of a place's 90 % interval that counts as determined"
+        ),
     ] = 5e-3,
     at: Annotated[
         str | None,
         typer.Option(
-            help="a target in the organ at rest [m], such as 0,0.07,0.005; default: its tumours, "
-            "or else where it is displaced most"
+            help="target in the organ at rest [m], e.g. 0,0.07,0.005; default: its tumours, "
+            "or else the vertex that moves most"
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Bring an organ to a cloud of points on its deformed surface: where is the tumour now?
 
-    Exit code 3: the model does not explain the cloud, and nothing is written. 4: written, but what
-    is not seen, or a target, is not determined.
+    Exit code 3: the model does not explain the cloud, and nothing is written. Exit code 4: written,
+    but the unseen part, or a target, is not determined.
     """
     from avatar_core.registration.cloud import read_cloud
     from avatar_core.registration.fit import RegistrationRule
@@ -126,7 +132,7 @@ def register(
         correlation=correlation,
         within=within,
     )
-    target = None if at is None else numbers("--at", at, (3,), "three numbers, as 0,0.07,0.005")
+    target = None if at is None else numbers("--at", at, (3,), "three numbers, e.g. 0,0.07,0.005")
     cloud = read_cloud(points, unit, parsed_axes(axes))
     say_notices(cloud.notices)
     vademecum = load_vademecum(file)
@@ -152,7 +158,7 @@ def register(
 
 
 def _sentence(one: Estimate) -> str:
-    """Return the displacement of a target with the standard deviations, and where it is."""
+    """Return the displacement of a target with its standard deviation, and its place."""
     import numpy as np
 
     size = 1e3 * float(np.linalg.norm(one.displacement))
@@ -168,7 +174,7 @@ def _sentence(one: Estimate) -> str:
 
 
 def _verdict(found: Registered, missing: Sequence[str]) -> str:
-    """Residual, rigid motion, and whether the model explains the cloud and it determines places."""
+    """Return residual, rigid motion, and whether the fit explains and determines."""
     import numpy as np
 
     motion = found.motion

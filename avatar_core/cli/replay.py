@@ -39,24 +39,27 @@ def replay(
     ] = 1e-9,
     tool: Annotated[
         str | None,
-        typer.Option(help="of a bag of several tools: NAME of the topics NAME/measured_cp"),
+        typer.Option(help="for a bag of several tools: NAME in the topics NAME/measured_cp"),
     ] = None,
     scene: Annotated[
         str | None,
         typer.Option(
-            help="of a bag: scene that ran, a file or the name of one that comes with avatar; "
-            "default: a sphere of 5 mm and the natural effects of the vademecum"
+            help="for a bag: scene that ran, a file or the name of a shipped scene; default: "
+            "a sphere of 5 mm and the effects that the vademecum requires"
         ),
     ] = None,
     tool_transform: ToolTransform = None,
     rate: Annotated[
-        float | None, typer.Option(help="of a bag: of the contact loop [Hz]; default: as it shows")
+        float | None,
+        typer.Option(
+            help="for a bag: rate of the contact loop [Hz]; default: the rate of its answers"
+        ),
     ] = None,
     device: Annotated[
         str,
         typer.Option(
-            help="of a bag without contact_state: safety.device of the contact node, whose limits "
-            "the forces kept: touch, omega or sigma"
+            help="for a bag without contact_state: safety.device of the contact node (touch, "
+            "omega or sigma), whose limits the forces kept"
         ),
     ] = "sigma",
 ) -> None:
@@ -88,7 +91,7 @@ def _replay_recording(file: Path, vademecum: Path, tolerance: float) -> None:
 
 
 class _How(NamedTuple):
-    """How a bag is read; see the options of the command."""
+    """Settings of reading a bag; see the options of the command."""
 
     tool: str | None
     scene: str | None
@@ -128,7 +131,7 @@ _COMPARED = {
 
 
 def _identity(bag: Bag, organ: Vademecum) -> list[str]:
-    """Refuse another vademecum than the bag names; what the bag leaves open."""
+    """Refuse another vademecum than the bag names; return notes about the bag's vademecums."""
     ids = bag.vademecum_ids
     if not ids:
         return ["no vademecum_info in the bag: whether it was made with this vademecum is unknown"]
@@ -142,7 +145,7 @@ def _identity(bag: Bag, organ: Vademecum) -> list[str]:
 
 
 def _scene_of(bag: Bag, name: str | None, organ: Vademecum) -> str:
-    """Return the scene of one tool that is given, that the bag holds, or the default, as YAML."""
+    """Return the scene of one tool as YAML: the given one, the bag's, or the default."""
     from avatar_core.contact.layout import default_effects
     from avatar_core.geometry.tip import Tip
     from avatar_core.scene.file import read_scene, scene_path, write_scene

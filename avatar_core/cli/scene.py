@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 scene = typer.Typer(
     help="Inspect scenes: YAML files that name organ, tools, outputs and effects.",
     no_args_is_help=True,
-    rich_markup_mode=None,  # which takes units, such as [m], for markup
+    rich_markup_mode=None,  # markup would remove units like [m]
 )
 
 
 @scene.command("list")
 def list_scenes() -> None:
-    """List the scenes that come with avatar."""
+    """List the shipped scenes."""
     from avatar_core.scene.file import read_scene, shipped_scenes
 
     shipped = shipped_scenes()
     if not shipped:
         raise SceneError(
-            "the scenes that come with avatar are not where it is installed; write one"
+            "the shipped scenes are missing from this installation; write a scene of your own"
         )
     for name, path in shipped.items():
         one = read_scene(path)
@@ -42,9 +42,7 @@ def list_scenes() -> None:
 
 @scene.command()
 def check(
-    file: Annotated[
-        str, typer.Argument(help="YAML file, or name of a scene that comes with avatar")
-    ],
+    file: Annotated[str, typer.Argument(help="YAML file, or name of a shipped scene")],
     vademecum: Annotated[
         Path | None,
         typer.Option(help="vademecum (.h5) to check the scene against; its step is then timed"),
@@ -97,7 +95,7 @@ def _material(one: Scene) -> str:
 
 
 def _tip(tip: Tip) -> str:
-    """Its shape, and the numbers that the shape uses."""
+    """Return a tip's shape, and the numbers that the shape uses."""
     return ", ".join([tip.shape, *_numbers(tip)])
 
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def show_text(v: Vademecum) -> None:
-    """Print what ``avatar show`` shows."""
+    """Print the text of ``avatar show``."""
     info, c = v.info(), v.certificate
     print(f"{info.name}  (from {info.source}, {v.provenance.unit}, axes {info.axes})")
     print(
@@ -29,7 +29,7 @@ def show_text(v: Vademecum) -> None:
         f"{info.n_modes} modes at a place, {info.n_regions} regions, {info.bytes / 1e6:.1f} MB"
     )
     if v.contrast is not None:
-        print(f"  tumour: Young's modulus {v.contrast:g} times that of the organ")
+        print(f"  tumour: {v.contrast:g} times the organ's Young's modulus")
     for support in v.supports:
         print(
             f"  support {support.name}: {support.stiffness:.3g} N/m^3 on "
@@ -44,10 +44,10 @@ def show_text(v: Vademecum) -> None:
         print("  no certificate")
         return
     print(
-        "  the force is that of a rigid, frictionless tip of the given shape and size, pressed\n"
-        "  along the surface's normal into the organ, on the surface that was read; the shaft\n"
-        "  is not felt. Its errors are under 'contact sites'; those of the patch are of the load\n"
-        "  that the vademecum was computed for"
+        "  the force acts on a rigid, frictionless tip of the given shape and size, pressed\n"
+        "  along the normal of the surface that was read; the shaft has no contact. Its errors\n"
+        "  are under 'contact sites'. Errors of a patch are those of the load that the vademecum\n"
+        "  was computed for"
     )
     where, every = " and values" if v.parametric else "", v.convergence
     of_all = ("displacement, all load positions", every.every_mean, every.every_worst)
@@ -73,13 +73,13 @@ def show_text(v: Vademecum) -> None:
 
 
 def _show_contact_sites(found: ContactSites) -> None:
-    """Print how far the force on real tips is from resolved contact."""
+    """Print the errors of the force on real tips against resolved contact."""
     if found.n_contacts == 0:
         print("  contact sites: none; --contact-sites of 'avatar vademecum' resolves contacts")
         return
     print(
-        f"  contact sites: {found.n_contacts} resolved contacts at {found.n_places} places; the "
-        f"error that is said covers {found.coverage:.0%},\n    a median of "
+        f"  contact sites: {found.n_contacts} resolved contacts at {found.n_places} places; "
+        f"the estimated error covers {found.coverage:.0%},\n    a median of "
         f"{found.overestimate:.1f} times the true one (the contact law's part times "
         f"{found.factor:.2f})"
     )
@@ -88,7 +88,7 @@ def _show_contact_sites(found: ContactSites) -> None:
 
 
 def _show_curve(curve: AccuracyCurve) -> None:
-    """Print the error of displacement by number of modes, and that of the force."""
+    """Print the error of displacement by number of modes, and the error of the force."""
     row = curve.of("surface").points
     where = f", timed on {curve.machine}" if curve.machine else ", not timed"
     print(f"  error that 95 % of touches keep, surface shown at every step{where}")
@@ -145,7 +145,7 @@ def supported_area(v: Vademecum, support: Support) -> float:
 
 
 def _show_resection(v: Vademecum) -> None:
-    """Print the volumes of both parts, and what the surface leaves of structures."""
+    """Print the volumes of both parts, and the margins of structures."""
     from avatar_core.vademecum.resected import margins, part_volumes
 
     if v.resection is None:

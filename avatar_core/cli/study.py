@@ -24,8 +24,8 @@ def study(
     surfaces: Annotated[
         Path | None,
         typer.Option(
-            help="folder of liver surfaces [mm]; default: ../shared/data/livers, or without it "
-            "generated ones, where a study can do with them"
+            help="folder of liver surfaces [mm]; default: ../shared/data/livers, or "
+            "generated livers if a study can use them"
         ),
     ] = None,
     quick: Annotated[
@@ -35,7 +35,7 @@ def study(
         bool, typer.Option("--resume", help="go on with an interrupted meshes or transport study")
     ] = False,
 ) -> None:
-    """Measure what avatar claims, or repeat an experiment of the paper beside its figures."""
+    """Measure the claims of avatar, or repeat an experiment of the paper beside its figures."""
     if name not in NAMES:
         print(f"avatar: no study '{name}'; choose one of {', '.join(NAMES)}", file=sys.stderr)
         raise typer.Exit(USAGE)

@@ -1,4 +1,4 @@
-"""``--timings FILE``: what each stage of a command takes, one line a stage and as JSON."""
+"""``--timings FILE``: time of each stage of a command, one line a stage and as JSON."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 Timings = Annotated[
     Path | None,
     typer.Option(
-        "--timings", help="print what each stage takes, and write it to this file (.json)"
+        "--timings", help="print the time of each stage, and write it to this file (.json)"
     ),
 ]
 
 
 @dataclass(frozen=True)
 class StageTime:
-    """Processor time of a stage, processes that it started included, and time that passed [s]."""
+    """Processor time of a stage, its child processes included, and elapsed time [s]."""
 
     stage: str
     cpu_seconds: float
@@ -37,7 +37,8 @@ class StageTime:
 class StageClock:
     """Times of the stages of a command, in their order; a stage goes on until the next begins.
 
-    The first, ``start``, began with the process. A stage that comes again is one with the first.
+    The first stage, ``start``, began with the process. The times of a stage that comes again are
+    added.
     """
 
     def __init__(self) -> None:
@@ -54,7 +55,7 @@ class StageClock:
         self._stage, self._cpu, self._clock = stage, cpu, clock
 
     def following(self, progress: Progress) -> Progress:
-        """What a build reports to, and whose stages are timed."""
+        """Return a progress function for a build, whose stages are timed."""
 
         def report(stage: str, fraction: float, error: float) -> None:
             self.begin(stage)
@@ -64,7 +65,7 @@ class StageClock:
 
     @property
     def stages(self) -> tuple[StageTime, ...]:
-        """Those that have ended."""
+        """Stages that have ended."""
         return tuple(StageTime(stage, *spent) for stage, spent in self._spent.items())
 
 

@@ -26,9 +26,10 @@ def uncertainty(
     given: Annotated[
         list[str],
         typer.Option(
-            help="what is known of a parameter: NAME=lognormal:MEDIAN:FACTOR, uniform:LOW:HIGH, "
-            "loguniform:LOW:HIGH or fixed:VALUE, with NAME young [Pa] or a coordinate of the "
-            "vademecum; or a file of them (.yaml), as params/uncertainty/liver.yaml. Others keep "
+            help="distribution of a parameter: NAME=lognormal:MEDIAN:FACTOR, "
+            "uniform:LOW:HIGH, loguniform:LOW:HIGH or fixed:VALUE, where NAME is young "
+            "[Pa] or a coordinate of the vademecum. Or a file of distributions (.yaml), "
+            "e.g. params/uncertainty/liver.yaml. May be repeated. Other parameters keep "
             "the vademecum's value"
         ),
     ],
@@ -36,11 +37,12 @@ def uncertainty(
     at: Annotated[
         list[str] | None,
         typer.Option(
-            help="place that is pressed [m], as 0,0.07,0.005; default: three places apart"
+            help="place that is pressed [m], e.g. 0,0.07,0.005; may be repeated; default: "
+            "three places far apart"
         ),
     ] = None,
     depths: Annotated[str, typer.Option(help="depths of the tip [mm]")] = _DEPTHS,
-    radius: Annotated[float, typer.Option(help="of the spherical tip [mm]")] = 5.0,
+    radius: Annotated[float, typer.Option(help="radius of the spherical tip [mm]")] = 5.0,
     target: Annotated[
         str | None,
         typer.Option(
@@ -51,9 +53,9 @@ def uncertainty(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="write numbers (.json) or a picture")
     ] = None,
-    seed: Annotated[int, typer.Option(help="of the draws")] = 0,
+    seed: Annotated[int, typer.Option(help="seed of the draws")] = 0,
 ) -> None:
-    """Show within which bands force and displacement lie, and which parameter makes them wide."""
+    """Show the bands of force and displacement, and the parameters that make them wide."""
     from avatar_core.geometry.tip import Tip
     from avatar_core.uncertainty.bands import force_bands
     from avatar_core.uncertainty.known import known_of
@@ -69,7 +71,7 @@ def uncertainty(
     vademecum = load_vademecum(file)
     known = known_of(vademecum, known)
     points = _points(vademecum, at)
-    wanted = "three numbers, as 0,0.05,0"
+    wanted = "three numbers, e.g. 0,0.05,0"
     aim = None if target is None else numbers("--target", target, (3,), wanted)
     with progress_bar("materials") as show:
         bands = force_bands(vademecum, known, points, pressed, tip, aim, draws, seed, show)
@@ -83,7 +85,7 @@ def uncertainty(
 
 
 def given_of(given: list[str]) -> dict[str, Distribution]:
-    """Return the distributions that options ``--given`` say."""
+    """Return the distributions of options ``--given``."""
     from avatar_core.uncertainty.distributions import parse, read_distributions
 
     found: dict[str, Distribution] = {}
@@ -101,16 +103,16 @@ def _depths(text: str) -> list[float]:
     from avatar_core.geometry.tip import MAX_DEPTH
 
     counts, most = tuple(range(1, 101)), 1e3 * MAX_DEPTH
-    found = numbers("--depths", text, counts, f"rising numbers [mm], as {_DEPTHS}")
+    found = numbers("--depths", text, counts, f"rising numbers [mm], e.g. {_DEPTHS}")
     fits = found[0] > 0.0 and found[-1] <= most and (np.diff(found) > 0.0).all()
     require(bool(fits), f"--depths is {text}; give rising numbers above 0, up to {most:g} mm")
     return [1e-3 * depth for depth in found]
 
 
 def _points(vademecum: Vademecum, at: list[str] | None) -> list[list[float]]:
-    """Where the tip presses [m]."""
+    """Return the places where the tip presses [m]."""
     from avatar_core.contact.tool_path import starts_apart
 
     if not at:
         return vademecum.surface.centers[starts_apart(vademecum, 3)].tolist()
-    return [numbers("--at", text, (3,), "three numbers, as 0,0.07,0.005") for text in at]
+    return [numbers("--at", text, (3,), "three numbers, e.g. 0,0.07,0.005") for text in at]

@@ -39,32 +39,34 @@ Unit = Annotated[str, typer.Option(help="unit of length in the files: mm, cm or 
 Axes = Annotated[
     str | None,
     typer.Option(
-        help="coordinate axes of the files: RAS, LPS, or the 16 numbers of a 4x4 matrix to RAS; "
-        "default: as each header states (SPACE=LPS, as 3D Slicer writes), else RAS"
+        help="coordinate axes of the files: RAS, LPS, or the 16 numbers of a 4x4 matrix to "
+        "RAS; default: the axes that each header states (3D Slicer writes SPACE=LPS), "
+        "else RAS"
     ),
 ]
 Label = Annotated[
     str | None,
     typer.Option(
-        help="number or name (.seg.nrrd, .dcm) of the organ in a label map; several, as 1,2,3, "
-        "are one organ"
+        help="number or name (.seg.nrrd, .dcm) of the organ in a label map; several, e.g. "
+        "1,2,3, are one organ"
     ),
 ]
 Groups = Annotated[
     Path | None,
     typer.Option(
-        help=".npz file with points 'clamped' and 'accessible' [m], instead of the rule (or the "
-        "atlas's template), and of supports by name"
+        help=".npz file with points 'clamped' and 'accessible' [m], and of supports by name; "
+        "it replaces the rule, or the atlas's template"
     ),
 ]
 Supports = Annotated[
     list[str] | None,
     typer.Option(
         "--support",
-        help="springs that hold the organ instead of the clamp, per area [N/m^3]: "
-        "bare_area=1e6, bare_area=1e5:1e9 to choose it later (not from an atlas), "
-        "bare_area=clamped, or bare_area alone for a guess; also cava_groove, falciform, "
-        "right_triangular, left_triangular and groups of --groups; may be repeated",
+        help="springs that hold the organ instead of the clamp, per area [N/m^3], e.g. "
+        "bare_area=1e6; bare_area=1e5:1e9 to choose it later (not from an atlas); "
+        "bare_area=clamped; or bare_area alone for a guess. Also cava_groove, "
+        "falciform, right_triangular, left_triangular and groups of --groups; may be "
+        "repeated",
     ),
 ]
 Vertices = Annotated[int, typer.Option(help="approximate number of mesh vertices")]
@@ -88,7 +90,9 @@ def vademecum(
     ] = None,
     modes: Annotated[
         int | None,
-        typer.Option(help="modes that show the displacement at a place, at most; default: 100"),
+        typer.Option(
+            help="largest number of modes that show the displacement at a place; default: 100"
+        ),
     ] = None,
     tolerance: Annotated[
         float | None,
@@ -99,8 +103,8 @@ def vademecum(
     resection: Annotated[
         Path | None,
         typer.Option(
-            help="file (.json, metres, RAS) of a plane or Bezier surface that the organ is cut "
-            "along; how far it is opened, 0 to 1, can be changed later"
+            help="file (.json, metres, RAS) of a plane or Bezier surface that cuts the "
+            "organ; its opening, 0 to 1, can be changed later"
         ),
     ] = None,
     element: Annotated[
@@ -110,22 +114,23 @@ def vademecum(
     coordinate: Annotated[
         list[str] | None,
         typer.Option(
-            help="material property that can be changed later, with its range: poisson=0.40:0.49, "
-            "or contrast=0.5:20 of a tumour; may be repeated"
+            help="material property that can be changed later, with its range, e.g. "
+            "poisson=0.40:0.49, or contrast=0.5:20 for a tumour; may be repeated"
         ),
     ] = None,
     tumour: Annotated[
         Path | None,
         typer.Option(
-            help="surface file of a tumour, in unit and axes of the organ unless it states its "
-            "own, or a label map; default with --tumour-label: that of the organ"
+            help="file of a tumour, a surface or a label map, in unit and axes of the organ "
+            "unless it states its own; default with --tumour-label: the organ's label "
+            "map"
         ),
     ] = None,
     tumour_label: Annotated[
         str | None,
         typer.Option(
-            help="number or name of the tumour in its label map; in that of the organ, it belongs "
-            "to the organ"
+            help="number or name of the tumour in its label map; in the organ's label map, "
+            "the tumour belongs to the organ"
         ),
     ] = None,
     contrast: Annotated[
@@ -133,7 +138,9 @@ def vademecum(
     ] = 1.0,
     material: Annotated[
         str,
-        typer.Option(help="linear, or neo-hookean or st-venant-kirchhoff for large deformation"),
+        typer.Option(
+            help="material: linear, or neo-hookean or st-venant-kirchhoff for large deformation"
+        ),
     ] = "linear",
     max_push: Annotated[
         float, typer.Option(help="depth up to which large deformation is built [m]")
@@ -165,7 +172,8 @@ def vademecum(
     displayed: Annotated[
         int | None,
         typer.Option(
-            help="vertices of the displayed surface, about; default: 8000; 0: those of the mesh"
+            help="approximate number of vertices of the displayed surface; default: 8000; 0: "
+            "the mesh's own"
         ),
     ] = None,
     timings: Timings = None,
@@ -253,7 +261,7 @@ def vademecum(
 
 
 def show(file: File, as_json: AsJson = False) -> None:
-    """Show what a vademecum contains, its certified errors, and what it cost to build."""
+    """Show a vademecum's contents, its certified errors, and the cost of its build."""
     from avatar_core.vademecum.storage import load_vademecum
 
     v = load_vademecum(file)
@@ -316,7 +324,7 @@ def read_organ(
 ) -> SurfaceMesh:
     """Return a surface from a file, or the built-in liver; see ``read_surface``.
 
-    Prints at once what was read: whatever is refused later, this may say why.
+    Prints the notices of reading at once: they may explain a later refusal.
     """
     from avatar_core.geometry.phantom import phantom_liver
     from avatar_core.geometry.surface import read_surface
@@ -336,7 +344,7 @@ def _read_with_tumour(
     tumour: Path | None,
     tumour_label: str | None,
 ) -> tuple[SurfaceMesh, SurfaceMesh | None]:
-    """An organ, with what was cut out of its label for the tumour, and the tumour if there is one.
+    """Return an organ, filled where its label leaves out the tumour, and the tumour if given.
 
     A tumour's label without a file is one of the organ's label map.
     """
@@ -344,7 +352,7 @@ def _read_with_tumour(
         return read_organ(surface, unit, axes, label), None
     if tumour is None:
         is_map = surface.lower().endswith(LABEL_MAPS)
-        require(is_map, f"--tumour-label is that of a label map, not of {surface}; give --tumour")
+        require(is_map, f"--tumour-label is for a label map, but {surface} is none; give --tumour")
         tumour = Path(surface)
     inside = (tumour_label,) if tumour_label and same_file(surface, tumour) else ()
     organ = read_organ(surface, unit, axes, label, inside)
@@ -354,7 +362,7 @@ def _read_with_tumour(
 def _read_tumour(
     file: Path, unit: str, axes: str | None, label: str | None, organ: SurfaceMesh
 ) -> SurfaceMesh:
-    """A tumour in the axes given, in those that its file states, or in those of the organ."""
+    """Return a tumour in the given axes, those that its file states, or the organ's."""
     from avatar_core.geometry.surface_files import stated_axes
     from avatar_core.geometry.tumour import read_tumour
 

@@ -29,7 +29,7 @@ def read_segmentation(path: Path) -> Volume:
     highdicom, dcmread = _libraries(path.name)
     head = dcmread(path, stop_before_pixels=True)
     if str(head.get("Modality", "")) != "SEG" or "SegmentSequence" not in head:
-        raise SurfaceError(f"{path.name}: DICOM, but no segmentation (SEG); give that of the organ")
+        raise SurfaceError(f"{path.name}: DICOM, but no segmentation (SEG); give the organ's")
     require_loadable(path.name, (int(head.NumberOfFrames), int(head.Rows), int(head.Columns)), 1)
     segmentation = highdicom.seg.segread(path)
     where = segmentation.get_volume_geometry(allow_missing_positions=True)

@@ -47,9 +47,9 @@ def size_notice(organ: SurfaceMesh) -> tuple[str, ...]:
     if low <= organ.volume <= high:
         return ()
     return (
-        f"the organ holds {in_ml(1e6 * organ.volume)}: the default clamp is that of a liver of "
-        f"{1e6 * low:.0f} to {1e6 * high:,.0f} ml; give points 'clamped' and 'accessible' "
-        "(--groups) of another organ",
+        f"the organ holds {in_ml(1000000.0 * organ.volume)}: the default clamp suits a liver "
+        f"of {1000000.0 * low:.0f} to {1000000.0 * high:,.0f} ml; give points 'clamped' and "
+        "'accessible' (--groups) for another organ",
     )
 
 

@@ -95,5 +95,5 @@ def _covered(mesh: TetMesh, points: np.ndarray) -> np.ndarray:
 def _unreadable(what: str) -> MeshError:
     return MeshError(
         f"cannot read node groups from {what}; it must be an .npz with arrays 'clamped' and "
-        "'accessible', or those of supports, of shape (n, 3) in metres"
+        "'accessible', or of supports, with the shape (n, 3) in metres"
     )

@@ -104,12 +104,12 @@ def _whole(values: NDArray[Any], name: str) -> tuple[NDArray[np.int32], tuple[st
             worst, example = off.max(), one.flat[np.argmax(off)]
     if worst > _OFF:
         raise SurfaceError(
-            f"{name}: values such as {example:.3g} are not labels; give the segmentation, "
+            f"{name}: values like {example:.3g} are not labels; give the segmentation, "
             "resampled without interpolation (nearest neighbour)"
         )
     if worst <= _EXACT:
         return labels, ()
-    return labels, (f"values such as {example:.4g} are read as the nearest whole number",)
+    return labels, (f"values like {example:.4g} are read as the nearest whole number",)
 
 
 # --- NIfTI ------------------------------------------------------------------------------------

@@ -18,8 +18,8 @@ def require_displayable(n: int) -> None:
     """Raise SurfaceError unless a surface of n vertices can be displayed."""
     if not _LIMITS[0] <= n <= _LIMITS[1]:
         raise SurfaceError(
-            f"{n} displayed vertices; ask for {_LIMITS[0]} to {_LIMITS[1]:,}, such as 20000, or 0 "
-            "for those of the mesh"
+            f"{n} displayed vertices; ask for {_LIMITS[0]} to {_LIMITS[1]:,}, e.g. 20000, or "
+            "0 for the mesh's own"
         )
 
 

@@ -35,7 +35,7 @@ class Jaw:
         For a number out of its range.
     """
 
-    radius: float = quantity("m", 5e-4, 20e-3, "of the disc that is held", 3e-3)
+    radius: float = quantity("m", 5e-4, 20e-3, "radius of the disc that is held", 3e-3)
     slip: float = quantity("N", 0.05, 100.0, "force at which tissue slips out", 4.0)
 
     def __post_init__(self) -> None:
@@ -60,7 +60,9 @@ class Tip:
     """
 
     shape: Shape = "sphere"
-    radius: float = quantity("m", 1e-3, 20e-3, "of the sphere, the punch or the cone's base", 5e-3)
+    radius: float = quantity(
+        "m", 1e-3, 20e-3, "radius of the sphere, the punch or the cone's base", 5e-3
+    )
     half_angle: float | None = quantity("deg", *ANGLES, "between a cone's axis and its side", None)
     rounding: float | None = quantity("m", 2e-4, 2e-2, "radius of a rounded cone's apex", None)
     grasp: Jaw | None = field(default=None, repr=False)  # what it touches does not depend on it

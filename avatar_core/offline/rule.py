@@ -13,7 +13,7 @@ Progress = Callable[[str, float, float], None]  # stage, fraction of it, current
 NO_ERROR = float("nan")
 
 _GLOBAL_PART = 0.4  # of the modes that a place may have
-_REGION_POSITIONS = 30  # load positions of a region at least, in the mean
+_REGION_POSITIONS = 30  # least mean number of load positions of a region
 
 
 def silent(stage: str, fraction: float, error: float) -> None:

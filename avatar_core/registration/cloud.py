@@ -244,8 +244,8 @@ def _columns(name: str, content: bytes) -> FloatArray:
     points = np.array([[float(row[k]) for k in chosen] for row in rows], np.float64).reshape(-1, 3)
     if not named and n > 3 and len(points) > 1 and (np.diff(points[:, 0]) >= 0.0).all():
         raise RegistrationError(
-            f"{name}: the first of its {n} columns only rises, as a time or a number does; leave "
-            "it out, or call the columns in the first line, such as t,x,y,z"
+            f"{name}: the first of its {n} columns only rises, like a time or a number; leave "
+            "it out, or name the columns in the first line, e.g. t,x,y,z"
         )
     return points
 

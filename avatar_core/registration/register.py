@@ -369,7 +369,7 @@ def _problems(found: Fit, rule: RegistrationRule, strain: float) -> tuple[str, .
         )
     if strain > _MOST_STRAIN:
         problems.append(
-            f"the organ would be strained by {strain:.0%} in the mean, which small strains do not "
+            f"the organ would be strained by {strain:.0%} on average, which small strains do not "
             "hold: something deforms it that the vademecum does not know"
         )
     if found.outlying > _MOST_OUTLYING:

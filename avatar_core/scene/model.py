@@ -97,15 +97,15 @@ class Scene:
     name: str = "palpation"
     text: str = ""
     vademecum: str = ""
-    young_modulus: float | None = quantity("Pa", 1.0, 1e8, "of the organ", None)
-    poisson_ratio: float | None = quantity("-", 0.0, 0.4999, "of the organ", None)
+    young_modulus: float | None = quantity("Pa", 1.0, 1e8, "Young's modulus of the organ", None)
+    poisson_ratio: float | None = quantity("-", 0.0, 0.4999, "Poisson's ratio of the organ", None)
     supports: tuple[SupportStiffness, ...] = ()
     resection: float | None = quantity("-", 0.0, 1.0, "opened part of the organ's cut", None)
     tools: tuple[Tool, ...] = (Tool(),)
     cloud: Cloud = "surface"
     cloud_divisor: int = quantity("-", 1, 1000, "the cloud is sent every so many steps", 1)
     modes: int | None = quantity(
-        "-", 1, 100_000, "of the cloud that move a vertex, in the mean", None
+        "-", 1, 100_000, "mean number of cloud modes that move a vertex", None
     )
     effects: tuple[Effect, ...] = ()
 
@@ -187,8 +187,9 @@ class Scene:
         for pair in combinations(self, vademecum):
             if pair.error is not None and pair.error > REFUSED:
                 raise SceneError(
-                    f"{' with '.join(pair.effects)}: {pair.how}, which is {pair.error:.0%} wrong "
-                    f"in the mean for this organ, above {REFUSED:.0%}; leave one of the two out"
+                    f"{' with '.join(pair.effects)}: {pair.how}, which is {pair.error:.0%} "
+                    f"wrong on average for this organ, above {REFUSED:.0%}; leave one of the "
+                    "two out"
                 )
 
 

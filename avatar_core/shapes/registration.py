@@ -234,8 +234,8 @@ class Registration:
 def not_converged(quality: RegistrationQuality) -> str:
     """Return the notice of a registration that is used although it did not converge."""
     return (
-        f"registration not converged: {quality.mean_distance * 1e3:.2g} mm from the surface in the "
-        "mean; check the regions, or register from a liver more like it"
+        f"registration not converged: {quality.mean_distance * 1000.0:.2g} mm mean distance "
+        "from the surface; check the regions, or register from a liver more like it"
     )
 
 

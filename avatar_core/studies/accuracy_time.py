@@ -127,8 +127,8 @@ class AccuracyTimeStudy(Study[AccuracyTimeSettings]):
             f"{run.kept['organ'].name}: a step that shows all {summary['vertices']:.0f} vertices "
             f"takes {summary['step_p50_us']:.0f} us and is within {summary['l2_95']:.1%} for 95 % "
             f"of unseen touches, its force within {summary['force_95']:.1%}; promised errors held "
-            f"for {summary['promise_kept_fraction']:.1%} of fresh touches, the error said with a "
-            f"force covered {summary['force_error_coverage']:.1%} of contacts"
+            f"for {summary['promise_kept_fraction']:.1%} of fresh touches, the estimated error of "
+            f"a force covered {summary['force_error_coverage']:.1%} of contacts"
         )
 
     def draw(self, figure: Figure, run: Run[AccuracyTimeSettings]) -> None:
@@ -195,7 +195,7 @@ def _panels(rows: list[Row], vademecum: Vademecum, fresh: StepErrors) -> tuple[P
     return (
         Panel("online, all vertices: fewer modes are faster", partial(_online, rows, "volume")),
         Panel("online, vertices of the surface alone", partial(_online, rows, "surface")),
-        Panel("error said with a force", partial(_force, fresh.force, _said(vademecum, fresh))),
+        Panel("estimated error of a force", partial(_force, fresh.force, _said(vademecum, fresh))),
         Panel("cost of effects: one that is not named costs nothing", partial(_effects, rows)),
         Panel("size of the mesh", partial(_offline, rows)),
     )
@@ -245,10 +245,10 @@ def _force(error: np.ndarray, said: np.ndarray, axes: Axes) -> None:
     axes.scatter(error, said, s=6, c="#0072B2", alpha=0.5, label="unseen contacts")
     ends = np.array([1e-4, 1.0])
     axes.plot(ends, ends, "k-", lw=1, label="said = true")
-    axes.plot(ends, 3 * ends, "k:", lw=1, label="said = 3 x true")
+    axes.plot(ends, 3 * ends, "k:", lw=1, label="estimated = 3 x true")
     axes.axhline(JND, color="#888888", ls="-.", label=_NOTICED)
     axes.set_xlim(1e-4, 1.0)
-    _logarithmic(axes, "true error of the force [-]", "error said with the force [-]")
+    _logarithmic(axes, "true error of the force [-]", "estimated error of the force [-]")
 
 
 def _effects(rows: list[Row], axes: Axes) -> None:

@@ -220,7 +220,7 @@ def _summary(rows: Sequence[Row], coordinate: Coordinate, seconds: float) -> dic
 def _sentence(summary: dict[str, float]) -> str:
     return (
         f"Over {LOW:g} to {HIGH:g} N/m^3 under the bare area the displacement misses full finite "
-        f"elements by {summary['support_l2_mean']:.1%} in the mean and "
+        f"elements by {summary['support_l2_mean']:.1%} on average and "
         f"{summary['support_l2_worst']:.1%} at worst; stiff springs are the clamp to "
         f"{summary['support_clamp_limit_worst']:.2%}, and on weak ones all but "
         f"{summary['support_free_limit_not_rigid']:.2%} of the motion is rigid."
@@ -232,8 +232,8 @@ _ERRORS = (
     "against full finite elements on the same mesh."
 )
 _LIMITS = (
-    "Full finite elements beyond the range: what a stiff support differs from the clamp, and what "
-    "of the motion on a weak one is not rigid."
+    "Full finite elements beyond the range: difference of a stiff support from the clamp, and the "
+    "part of the motion on a weak one that is not rigid."
 )
 
 
@@ -260,6 +260,6 @@ def _draw_limits(axes: Axes, rows: Sequence[Row]) -> None:
         axes.loglog(
             _of(rows, kind, "stiffness"), 100.0 * _of(rows, kind, key), "o-", ms=3, label=text
         )
-    axes.set(xlabel="stiffness of the support [N/m³]", ylabel="of the displacement, L2 [%]")
+    axes.set(xlabel="stiffness of the support [N/m³]", ylabel="error of the displacement, L2 [%]")
     axes.grid(which="both", alpha=0.3)
     axes.legend(fontsize=7)

@@ -104,11 +104,11 @@ class ContactStudy(Study[ContactSettings]):
     def sentence(self, run: Run[ContactSettings]) -> str:
         summary = run.summary
         return (
-            f"Of {len(run.rows)} resolved contacts the force misses {summary['force_mean']:.1%} in "
-            f"the mean, 95 % of them by less than {summary['force_p95']:.1%}, the worst by "
-            f"{summary['force_worst']:.1%}; the patch alone misses {summary['patch_mean']:.0%}, "
-            f"Hertz on a half-space {summary['hertz_mean']:.0%}. The error that is said covers "
-            f"{summary['coverage']:.0%}."
+            f"On {len(run.rows)} resolved contacts the mean error of the force is "
+            f"{summary['force_mean']:.1%}, for 95 % of them below {summary['force_p95']:.1%}, "
+            f"at worst {summary['force_worst']:.1%}; the patch alone misses "
+            f"{summary['patch_mean']:.0%}, Hertz on a half-space {summary['hertz_mean']:.0%}. "
+            f"The estimated error covers {summary['coverage']:.0%}."
         )
 
     def draw(self, figure: Figure, run: Run[ContactSettings]) -> None:

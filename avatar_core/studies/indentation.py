@@ -96,7 +96,7 @@ class IndentationStudy(Study[IndentationSettings]):
     def sentence(self, run: Run[IndentationSettings]) -> str:
         summary = run.summary
         return (
-            "A sphere pressed into neo-Hookean tissue of nu 0.49 feels "
+            "A sphere pressed into neo-Hookean tissue of nu 0.49 has "
             f"{summary['ratio_nu_0.49_depth_0.5']:.3f} of the small-strain force at half its "
             f"radius, {summary['ratio_nu_0.49_depth_1']:.3f} at its radius, "
             f"{summary['ratio_nu_0.49_depth_1.5']:.3f} at 1.5. The law misses the elements by "

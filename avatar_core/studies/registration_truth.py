@@ -246,8 +246,7 @@ class Truth:
         return load
 
     def _pressure(self, rng: np.random.Generator, face: int | None) -> FloatArray:
-        """Return a constant pressure within 50 to 80 mm of a face, a third per edge, or all over.
-        """
+        """Return a constant pressure within 50 to 80 mm of a face, or all over: a third an edge."""
         mesh = self.mesh
         centre = mesh.vertices[mesh.boundary_faces].mean(axis=1)
         unit = mesh.face_area_normals / mesh.face_areas[:, None]

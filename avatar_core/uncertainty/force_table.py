@@ -127,8 +127,9 @@ def _pressed(
         if not (force[i] > 0.0).all():
             x, y, z = 1e3 * surface.centers[j]
             raise ContactError(
-                f"nothing is felt of a tip {1e3 * depths[0]:g} to {1e3 * depths[-1]:g} mm deep at "
-                f"({x:.0f}, {y:.0f}, {z:.0f}) mm; choose another place, or other depths"
+                f"no force acts on a tip {1000.0 * depths[0]:g} to {1000.0 * depths[-1]:g} mm "
+                f"deep at ({x:.0f}, {y:.0f}, {z:.0f}) mm; choose another place, or other "
+                "depths"
             )
     return force
 

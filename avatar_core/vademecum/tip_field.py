@@ -57,7 +57,7 @@ FADING = 0.5  # distance beyond the accessible surface over which access fades, 
 TUMOUR_SMOOTHING = 1.0  # standard deviation of the kernel for f, in spacings
 TUMOUR_CONTACT = 4e-3  # radius of the contact for which f is sampled [m],
 TUMOUR_REACH = 2.0  # and patch radii within which energy counts: they fit resolved contacts of
-# spheres of 1.5 to 10 mm, 2 and 5 mm above a tumour, with the least error in the mean
+# spheres of 1.5 to 10 mm, 2 and 5 mm above a tumour, with the least mean error
 
 # The surface that phi is the distance to: vertices (n, 3) float32 [m], faces (m, 3) int32.
 Outline = namedtuple("Outline", ["vertices", "faces"])

@@ -49,8 +49,8 @@ class Inertia(Effect):
     superposed: ClassVar[bool] = True
     moving: ClassVar[bool] = True
 
-    density: float = quantity("kg/m^3", 100.0, 5000.0, "of the organ", 1060.0)
-    damping: float = quantity("-", 0.0, 2.0, "of every mode, over its critical damping", 0.1)
+    density: float = quantity("kg/m^3", 100.0, 5000.0, "density of the organ", 1060.0)
+    damping: float = quantity("-", 0.0, 2.0, "damping of every mode over its critical damping", 0.1)
 
     def require(self, vademecum: Vademecum) -> None:
         """Refuse a vademecum without the mass of the organ."""

@@ -37,10 +37,14 @@ class Respiration(Effect):
         shift=array("3"),  # x(t) [m]
     )
 
-    period: float = quantity("s", 0.5, 60.0, "of a breath", 4.0)
+    period: float = quantity("s", 0.5, 60.0, "period of a breath", 4.0)
     amplitude: float = quantity("m", 0.0, 0.05, "from breath out to breath in", 0.012)
     axis: tuple[float, ...] = quantity(
-        "-", -1e3, 1e3, "of breath in, in the organ's frame (RAS, caudal: 0 0 -1)", (0.0, 0.0, -1.0)
+        "-",
+        -1e3,
+        1e3,
+        "direction of breath in, in the organ's frame (RAS, caudal: 0 0 -1)",
+        (0.0, 0.0, -1.0),
     )
     dwell: int = quantity("-", 1, 10, "n, how long the breath stays out", 3)
 

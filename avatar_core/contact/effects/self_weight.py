@@ -32,10 +32,14 @@ class SelfWeight(Effect):
     superposed: ClassVar[bool] = True
     moving: ClassVar[bool] = True
 
-    density: float = quantity("kg/m^3", 100.0, 5000.0, "of the organ", 1060.0)
+    density: float = quantity("kg/m^3", 100.0, 5000.0, "density of the organ", 1060.0)
     gravity: float = quantity("m/s^2", 0.0, 100.0, "acceleration", 9.81)
     direction: tuple[float, ...] = quantity(
-        "-", -1e3, 1e3, "of gravity in the organ's frame (supine, RAS: 0 -1 0)", (0.0, -1.0, 0.0)
+        "-",
+        -1e3,
+        1e3,
+        "direction of gravity in the organ's frame (supine, RAS: 0 -1 0)",
+        (0.0, -1.0, 0.0),
     )
 
     def __post_init__(self) -> None:

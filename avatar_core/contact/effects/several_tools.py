@@ -41,7 +41,7 @@ class SeveralTools(Effect):
     """More than one tool touches at once, coupled through the organ."""
 
     name: ClassVar[str] = "several_tools"
-    text: ClassVar[str] = "tools feel each other through the organ"
+    text: ClassVar[str] = "tools are coupled through the organ"
     Constants: ClassVar[Any] = kind(
         "SeveralTools",
         reach=array("1"),  # of the near field [m]

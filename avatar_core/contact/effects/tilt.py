@@ -61,7 +61,8 @@ class Tilt(Effect):
     )
 
     axis: tuple[float, ...] = quantity(
-        "-", -1e3, 1e3, "of the tools in the frame of their poses, from the tip to the shaft",
+        "-", -1e3, 1e3, "axis of the tools in the frame of their poses, from the tip to the "
+                        "shaft",
         (0.0, 0.0, -1.0),
     )  # fmt: skip
 

@@ -176,7 +176,7 @@ def test_an_organ_includes_the_tumour_that_was_cut_out_of_its_label(
     assert 1e6 * organ.volume == pytest.approx(38**3 * 0.027, rel=0.01)
     assert lesion is not None and 1e6 * lesion.volume == pytest.approx(27.0, rel=0.1)
     assert organ.notices == ("read label 7, 1,455 ml; label 3, 27 ml, inside: 100%",)
-    with pytest.raises(AvatarError, match="--tumour-label is that of a label map"):
+    with pytest.raises(AvatarError, match="--tumour-label is for a label map"):
         _read_with_tumour("liver.obj", "mm", None, None, None, "3")
 
 

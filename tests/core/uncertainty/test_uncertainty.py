@@ -172,7 +172,7 @@ def test_what_a_vademecum_does_not_have_is_refused(phantom_vademecum: Vademecum)
 
 def test_a_place_where_nothing_is_felt_is_named(phantom_vademecum: Vademecum) -> None:
     v = phantom_vademecum
-    with pytest.raises(ContactError, match="nothing is felt of a tip 40 to 40 mm deep at"):
+    with pytest.raises(ContactError, match="no force acts on a tip 40 to 40 mm deep at"):
         force_table(v, Tip("sphere", 5e-3), starts_apart(v, 1), [40e-3], target=0)
 
 
