@@ -106,7 +106,7 @@ def register(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Bring an organ to a cloud of points on its deformed surface: where is the tumour now?
+    """Bring an organ to a cloud of points on its deformed surface, and tell where its tumour is.
 
     Exit code 3: the model does not explain the cloud, and nothing is written. Exit code 4: written,
     but the unseen part, or a target, is not determined.
