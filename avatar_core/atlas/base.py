@@ -30,7 +30,7 @@ class PatientBase:
 
     Attributes
     ----------
-    template, loads : Template
+    template, loads : Template, LoadSurface
         Template and the load positions of its mesh and regions.
     material : Material
         Material of all responses.
@@ -39,18 +39,18 @@ class PatientBase:
     vertices : Vectors
         n arrays of shape (n_template, 3) [m], the template registered to each anatomy.
     responses : Sequence[CompactResponse]
-        One CompactResponse per anatomy; may be a lazy sequence.
+        One response per anatomy; may be a lazy sequence.
     copies : tuple[int, ...]
         Numbers of anatomies that repeat an earlier one, and get no weight.
     distances : Sequence[ndarray] or None
-        Signed distances of each anatomy on a common grid, n arrays of shape (n_grid,), or None; may
-        be a lazy sequence.
+        Signed distances of each anatomy on a common grid, n arrays of shape (n_grid,). May be a
+        lazy sequence.
     distance_of : Callable[[SurfaceMesh, Registration], ndarray] or None
-        Signed distances of a new surface on the same grid, or None.
+        Function that returns the signed distances of a new surface on the same grid.
     rule : TemplateRule
-        TemplateRule of all registrations.
+        Rule of all registrations.
     registration_of : Callable[[str], Registration or None]
-        Registration of the anatomy with a hash of its file, or None.
+        Function that returns the registration of the anatomy with a hash of its file.
     """
 
     template: Template

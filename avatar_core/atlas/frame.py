@@ -20,16 +20,16 @@ SLACK = 0.018  # on every side, since organs are aligned by shape and not by the
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Template, grid and rule that all anatomies of an atlas share; fixed when it is created.
+    """Template, grid and rule of all anatomies of an atlas; fixed when it is created.
 
     Attributes
     ----------
     template : Template
-        Registered to every anatomy.
+        Template registered to every anatomy.
     box : GridBox
-        GridBox around the template, at whose points signed distances are taken.
+        Box around the template, at whose points signed distances are taken.
     rule : TemplateRule
-        TemplateRule of all registrations.
+        Rule of all registrations.
     """
 
     template: Template

@@ -78,13 +78,13 @@ class AtlasOptions:
     Attributes
     ----------
     template_vertices : int
-        Approximate number, of the mesh of the built-in liver, the template.
+        Approximate number of vertices of the template, the mesh of the built-in liver.
     largest : tuple[float, float, float]
         Size of the largest organ that fits into the box, along x, y, z [m].
     spacing : float
         Spacing of the grid in the box [m].
     rule : TemplateRule
-        TemplateRule of all registrations.
+        Rule of all registrations.
     """
 
     template_vertices: int = 2500

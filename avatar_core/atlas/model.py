@@ -60,11 +60,18 @@ class Lazy(Sequence[Item], Generic[Item]):
 class Atlas:
     """Anatomies that can be compared.
 
+    Attributes
+    ----------
     frame : Frame
-    anatomies : in the order of their names
-    read_distances : signed distances of an anatomy, shape (n_points,) [m]
-    read_response : Response of an anatomy that has one
+    anatomies : tuple[Anatomy, ...]
+        Anatomies in the order of their names.
+    read_distances : Callable
+        Function that returns the signed distances of an anatomy, shape (n_points,) [m].
+    read_response : Callable
+        Function that returns the Response of an anatomy that has one.
 
+    Notes
+    -----
     The readers raise StorageError for a file that is missing, altered or of another anatomy.
     """
 
@@ -90,7 +97,7 @@ class Atlas:
         return Lazy(lambda i: self.read_distances(self.anatomies[i]), len(self))
 
     def index(self, name: str) -> int:
-        """Number of an anatomy.
+        """Return the number of an anatomy.
 
         Raises AtlasError if there is none of that name.
         """
@@ -110,7 +117,7 @@ class Atlas:
         return tuple(Duplicate(self.names[i], self.names[self.same_as[i]]) for i in repeated)
 
     def registration(self, name: str) -> Registration:
-        """The registration of an anatomy, without its history."""
+        """Return the registration of an anatomy, without its history."""
         one, template = self[name], self.frame.template
         mesh = TetMesh(one.registered, template.mesh.tets)
         return Registration(template, mesh, one.alignment, one.quality, (), one.converged)

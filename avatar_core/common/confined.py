@@ -1,8 +1,8 @@
 """Calls in a separate process with limits of time and memory, for reading files of others.
 
-Some damaged files crash the libraries behind HDF5 and NIfTI (a segmentation fault of HDF5 2.0),
-hang them or make them allocate all memory, before any check of this project. In a process of their
-own they do no harm: if it dies, another is started.
+Some damaged files crash the libraries behind HDF5 and NIfTI (a segmentation fault of HDF5 2.0).
+Others hang them or make them allocate all memory, before any check of this project. In a process of
+their own they do no harm: if it dies, another is started.
 
 This protects against accidents, not against attacks: results are pickled, and the process has the
 rights of its user.

@@ -49,8 +49,12 @@ SINGLE_ERROR = 1e-3  # relative, up to which single precision serves: modes leav
 class Material:
     """Isotropic linear elastic material; the defaults are the liver of the paper, Sec. 3.1.
 
-    young_modulus : E > 0 [Pa]
-    poisson_ratio : 0 <= nu < 0.5
+    Attributes
+    ----------
+    young_modulus : float
+        E > 0 [Pa].
+    poisson_ratio : float
+        0 <= nu < 0.5.
     """
 
     young_modulus: float = 0.17e6
@@ -75,7 +79,7 @@ class Material:
 
     @property
     def plane_strain_modulus(self) -> float:
-        """E* = E / (1 - nu^2) [Pa], which a rigid tip feels (Hertz 1882)."""
+        """E* = E / (1 - nu^2), the modulus against a rigid tip (Hertz 1882) [Pa]."""
         return self.young_modulus / (1.0 - self.poisson_ratio**2)
 
     @property

@@ -1,7 +1,7 @@
 """Stiffness matrices of isotropic elasticity from products of scalar gradients.
 
-Everything follows from G_iajb = int chi d_i phi_a d_j phi_b dx. phi_a are the shape functions of
-one component, and chi is the volume fraction of the material in each tetrahedron:
+Everything follows from G_iajb = int chi d_i phi_a d_j phi_b dx. Here phi_a are the shape functions
+of one component, and chi is the volume fraction of the material in each tetrahedron:
 
     int chi div(u) div(v)          ->  G_iajb,
     int chi 2 eps(u):eps(v)        ->  delta_ij sum_k G_kakb + G_jaib,

@@ -229,7 +229,7 @@ def tetrahedralize(surface: SurfaceMesh, n_vertices: int = 2850) -> TetMesh:
     The same surface gives the same mesh, bit for bit, and the mesh holds its volume.
 
     fTetWild accepts cracked, doubled and self-intersecting faces (Hu et al., "Fast Tetrahedral
-    Meshing in the Wild", 2020). It fills a box; tetrahedra are kept if the winding number of the
+    Meshing in the Wild", 2020). It fills a box. Tetrahedra are kept if the winding number of the
     surface at their centroid says inside. fTetWild's own filter sometimes loses a lobe of a folded
     liver.
 

@@ -55,11 +55,17 @@ VISCERAL_NORMAL = (-0.56, -0.42, -0.71)
 
 
 def phantom_liver(spacing: float = 7e-3) -> SurfaceMesh:
-    """Liver-like organ of about 1.5 litres, closed, one component, always the same.
+    """Return a liver-like organ of about 1.5 litres, closed, one component, always the same.
 
-    spacing : of the marching grid [m]; the mean edge is about 0.9 of it
+    Parameters
+    ----------
+    spacing : float
+        Spacing of the marching grid [m]; the mean edge is about 0.9 of it.
 
-    Raises SurfaceError if the spacing is too coarse for the notch or needlessly fine.
+    Raises
+    ------
+    SurfaceError
+        If the spacing is too coarse for the notch or needlessly fine.
     """
     if not 1e-3 <= spacing <= 12e-3:
         raise SurfaceError(f"phantom: spacing {spacing:.3g} m; choose 0.001 to 0.012 m")

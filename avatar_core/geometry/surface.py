@@ -43,15 +43,27 @@ _DIRECTIONS = {
 class SurfaceMesh:
     """A triangulated organ surface in metres, axes RAS (+x right, +y anterior, +z superior).
 
-    vertices : ndarray, shape (n, 3) [m]
-    faces : ndarray of int32, shape (m, 3), counter-clockwise seen from outside
-    name : what the surface is called, the stem of its file
-    unit : unit of the file it came from (the vertices are in metres whatever it says)
-    axes : ndarray, shape (4, 4), rigid map from the file's coordinates (in its unit) to RAS
-    notices : what was changed, dropped or contradictory on reading, one line each
-    source_sha256 : hash of the file's bytes, empty for a generated surface
+    Attributes
+    ----------
+    vertices : ndarray, shape (n, 3)
+        Vertices [m].
+    faces : ndarray of int32, shape (m, 3)
+        Corners, counter-clockwise seen from outside.
+    name : str
+        Name of the surface, the stem of its file.
+    unit : str
+        Unit of its file; the vertices are always in metres.
+    axes : ndarray, shape (4, 4)
+        Rigid map from the file's coordinates (in its unit) to RAS.
+    notices : tuple[str, ...]
+        Changes, drops and contradictions on reading, one line each.
+    source_sha256 : str
+        Hash of the file's bytes, empty for a generated surface.
 
-    Raises SurfaceError if the arrays are empty, not finite or do not fit each other.
+    Raises
+    ------
+    SurfaceError
+        If the arrays are empty, not finite or do not fit each other.
     """
 
     vertices: FloatArray

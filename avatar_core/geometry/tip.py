@@ -44,14 +44,17 @@ class Jaw:
 
 @dataclass(frozen=True)
 class Tip:
-    """The part of a tool that touches; its axis is taken along the surface's normal, but for a
-    flat punch with :class:`avatar_core.contact.effects.Tilt`.
+    """The part of a tool that touches: a sphere, a flat punch or a cone.
 
-    A pose is that of the centre of a sphere, of the sphere that rounds a cone, of the face of a
-    flat punch, or of the apex of a cone. A "patch" is no tool: it is the load that a vademecum
-    was computed for, whatever the radius, under which its certificate's compliance is felt.
+    Its axis is taken along the surface's normal, except for a flat punch with
+    :class:`avatar_core.contact.effects.Tilt`. A pose is the centre of a sphere or of a cone's
+    rounding, the face of a flat punch, or the apex of a cone. A "patch" is no tool. It is the load
+    of the vademecum, whatever the radius, with the compliance of its certificate.
 
-    grasp : jaws that close at the lowest point of the tip; None for a tool that only pushes
+    Attributes
+    ----------
+    grasp : Jaw or None
+        Jaws that close at the lowest point of the tip; None for a tool that only pushes.
 
     Raises
     ------
@@ -65,7 +68,7 @@ class Tip:
     )
     half_angle: float | None = quantity("deg", *ANGLES, "between a cone's axis and its side", None)
     rounding: float | None = quantity("m", 2e-4, 2e-2, "radius of a rounded cone's apex", None)
-    grasp: Jaw | None = field(default=None, repr=False)  # what it touches does not depend on it
+    grasp: Jaw | None = field(default=None, repr=False)  # the contact does not depend on it
 
     def __post_init__(self) -> None:
         if self.shape not in get_args(Shape):
@@ -91,7 +94,7 @@ class Tip:
         return self.rounding or 0.0
 
     def height(self, r: np.ndarray) -> np.ndarray:
-        """f(r) [m]; infinite beyond the radius."""
+        """Return f(r) [m]; infinite beyond the radius."""
         r = np.asarray(r, float)
         if self.shape in ("sphere", "patch"):
             inside = _sphere_height(r, self.radius)
@@ -107,13 +110,14 @@ class Tip:
         return np.where(r <= self.radius, inside, np.inf)
 
     def depth(self, a: np.ndarray) -> np.ndarray:
-        """g(a) [m]: how deep the tip sinks into a half-space until the contact has radius a.
+        """Return g(a) [m], the depth in a half-space at which the contact has radius a.
 
-        Closed forms of Sneddon (1965); that of the rounded cone is integrated here.
+        Closed forms of Sneddon (1965); the rounded cone's is integrated here.
 
         Parameters
         ----------
-        a : ndarray [m], from 0 to the radius (below it, for a sphere)
+        a : ndarray
+            Contact radius [m], from 0 to the radius (below it, for a sphere).
         """
         if self.shape == "sphere":
             return a * np.arctanh(a / self.radius)
@@ -131,7 +135,7 @@ class Tip:
         return np.where(a > t, a * side, round_part)
 
     def depth_slope(self, a: np.ndarray) -> np.ndarray:
-        """dg/da, for the same a."""
+        """Return dg/da for the same a."""
         if self.shape == "sphere":
             return np.arctanh(a / self.radius) + a * self.radius / (self.radius**2 - a**2)
         if self.shape == "flat":

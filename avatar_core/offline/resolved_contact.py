@@ -5,7 +5,7 @@ It is fitted there to the surface, factorized once, and condensed to the part th
 can reach.
 
 Balls are pressed in along the normal of the place. Their position stays, while the axis of their
-tractions is turned until it leads through the centre of pressure and the ball's centre: without
+tractions is turned until it leads through the centre of pressure and the ball's centre. Without
 friction a ball has no moment. Beside a fold, that changed the force by up to a tenth.
 """
 

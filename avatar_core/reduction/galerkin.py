@@ -12,7 +12,7 @@ the solutions for the loads whose residual r = f - K X Y^T is largest in the nor
     eta(s)^2 = r(s) . D^-1 r(s).
 
 The norm is relative to the compliance under the patch or to the same norm of the load, whichever
-gives more: where a thin lobe gives way, the compliance is large and hides a large error. A few
+gives more. Where a thin lobe gives way, the compliance is large and hides a large error. A few
 *probes* are loads solved exactly that never enter the space. They calibrate eta as an estimate of
 the error of every load, and give the residual compliance under a patch.
 """

@@ -3,9 +3,9 @@
     u(x, s_j) ~ sum_m Z_m(x) W_m(s_j),    m over the modes of the region that holds s_j.
 
 Loads near one another move an organ alike. Some dozen modes for each of some dozen regions leave a
-smaller error than hundreds of modes for all loads at once, and a step reads only the modes of the
-tip's region. Each load position belongs to one region. Between positions the response is
-interpolated. It is therefore as smooth where a tip crosses between regions as within one.
+smaller error than hundreds of modes for all loads at once. A step reads only the modes of the tip's
+region. Each load position belongs to one region. Between positions the response is interpolated. It
+is therefore as smooth where a tip crosses between regions as within one.
 :mod:`avatar_core.reduction.block_field` separates these modes once more, in space.
 
 The modes of a region are the principal components of its columns (Eckart & Young, Psychometrika 1,

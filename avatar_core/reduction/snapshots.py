@@ -1,7 +1,7 @@
 """Proper orthogonal decomposition, the rival of PGD: the best that any n modes can do.
 
 The modes of snapshots U are the left singular vectors of M^(1/2) U D^-1 (Eckart & Young,
-Psychometrika 1, 1936), with the mass M of the norm in space and the size D of each snapshot where
+Psychometrika 1, 1936). M is the mass of the norm in space. D is the size of each snapshot where
 errors are relative. POD needs every snapshot, and so every solution, before it begins.
 """
 

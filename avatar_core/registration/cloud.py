@@ -40,11 +40,13 @@ class Cloud:
     Attributes
     ----------
     points : ndarray, shape (n, 3)
-        Points [m], RAS; those that stand several times are kept once.
+        Points in RAS [m]; repeated points are kept once.
     name : str
-        Name of the file; ``unit`` that was applied.
+        Name of the file.
+    unit : str
+        Unit of length that was applied.
     notices : tuple[str, ...]
-        What was left out, one line each.
+        Points that were left out, one line each.
     """
 
     points: FloatArray
@@ -80,7 +82,7 @@ class Cloud:
         return _extent(self.points)
 
     def thinned(self) -> FloatArray:
-        """At most ``MOST_POINTS`` of the points, shape (n, 3) [m]."""
+        """Return at most ``MOST_POINTS`` of the points, shape (n, 3) [m]."""
         if len(self.points) <= MOST_POINTS:
             return self.points
         chosen = np.random.default_rng(0).choice(len(self.points), MOST_POINTS, replace=False)
@@ -108,11 +110,12 @@ def read_cloud(path: str | Path, unit: str = "mm", axes: str | ArrayLike | None 
 
     Parameters
     ----------
+    path : str or Path
     unit : str
-        "m", "cm" or "mm", of the file's coordinates.
+        Unit of the file's coordinates: "m", "cm" or "mm".
     axes : str or array_like or None
-        Axes where the file's +x, +y, +z point, or a rigid (4, 4) matrix to RAS, in the file's unit;
-        None: as the file's header states, RAS if it states none.
+        Directions of the file's +x, +y, +z, or a rigid (4, 4) matrix to RAS in the file's unit.
+        None: the axes that the file's header states, else RAS.
 
     Raises
     ------

@@ -47,24 +47,36 @@ from avatar_core.vademecum.model import Vademecum
 
 @dataclass(frozen=True)
 class RegistrationRule:
-    """Prior knowledge and stopping.
+    """Prior knowledge, and limits of the iteration.
 
-    noise : least standard deviation of a point of the cloud along the normal [m]; it stands as well
-        for what small strains and meshes leave out
-    turn, shift : prior root mean squares of the rigid motion, all axes together [rad, m]; nearly 0
-        where the cloud's frame is the organ's
-    kind : of the loads, see :mod:`avatar_core.registration.loads`; None for smooth or few, by what
-        each predicts of patches that are left out
-    forces : where they may act, see :func:`avatar_core.registration.loads.allowed_at`
-    support_shift : prior root mean square by which each support of the vademecum moves [m]; 0: none
-        does
-    correlation : length over which errors of the points, as large as the noise, are alike [m]; 0
-        if each has its own. Those of the mesh are alike over an edge at least
-    within : a place counts as determined if its interval of 90 % is no wider to either side [m]
-    freedom : degrees of freedom of Student's distribution, from which points are weighed
-    tolerance : step of a point of the surface that ends the iteration [m]
-    rigid_steps, most_steps : iterations that move rigidly alone, and all, at most
-    rescaled : steps after the rigid ones at which the scales are sought
+    Attributes
+    ----------
+    noise : float
+        Least standard deviation of a point along the normal [m], also for errors of strain and
+        mesh.
+    turn, shift : float
+        Prior root mean squares of the rigid motion, all axes together [rad, m]; near 0 in a known
+        frame.
+    kind : Kind or None
+        Kind of the loads (:mod:`avatar_core.registration.loads`); None for the better of smooth and
+        few.
+    forces : str
+        Places where forces may act, see :func:`avatar_core.registration.loads.allowed_at`.
+    support_shift : float
+        Prior root mean square motion of each support of the vademecum [m]; 0 for none.
+    correlation : float
+        Length over which errors of the points are correlated [m]; 0 for none. Mesh errors always
+        are.
+    within : float
+        Largest half-width of a place's 90 % interval that counts as determined [m].
+    freedom : float
+        Degrees of freedom of Student's distribution, which weights points.
+    tolerance : float
+        Step of a surface point that ends the iteration [m].
+    rigid_steps, most_steps : int
+        Numbers of rigid iterations, and of all iterations at most.
+    rescaled : tuple[int, ...]
+        Steps after the rigid ones at which the scales are sought.
     """
 
     noise: float = 1e-3
@@ -94,7 +106,7 @@ class RegistrationRule:
             )
 
     def scales(self, kind: Kind, young_modulus: float) -> Scales:
-        """Prior scales of loads, length, noise and mismatch."""
+        """Return prior scales of loads, length, noise and mismatch."""
         loads = 0.02 if kind == "few" else 0.02 * young_modulus  # displacement [m], traction [Pa]
         mismatch = 1.0 if self.correlation else 0.5 if kind == "few" else 0.2  # of the noise
         middle = np.log([loads, 0.03, self.noise, mismatch * self.noise])
@@ -102,7 +114,7 @@ class RegistrationRule:
 
     @property
     def least_scales(self) -> FloatArray:
-        """Logarithms below which scales are not sought: what is said of the noise stands."""
+        """Logarithms below which scales are not sought: the stated noise is a lower limit."""
         alike = np.log(self.noise) if self.correlation else -np.inf
         return np.array([-np.inf, -np.inf, np.log(self.noise), alike])
 

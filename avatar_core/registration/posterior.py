@@ -3,7 +3,7 @@
     d = J z + e,   z ~ N(0, S^2),   e ~ N(0, sigma^2 / W + tau^2 C)
 
 J are the derivatives of the distances from the surface, W the robust weights of the points. C is
-one for points of a common cell, as large as a triangle of the mesh, and zero for others: tau is the
+one for points of a common cell, as large as a triangle of the mesh, and zero for others. tau is the
 distance of the organ's true surface from the mesh. The scales of prior and noise are those that
 make the cloud most likely (MacKay, Neural Computation 4, 1992). Their own uncertainty is included
 by the points of an unscented transform (Julier & Uhlmann, Proc. IEEE 92, 2004).

@@ -86,22 +86,21 @@ class Registered:
     fit : Fit
         Its loads, motion and residuals.
     displacement : ndarray, shape (n_vertices, 3)
-        Displacement [m], by deformation, along the axes at rest.
+        Displacement by deformation, along the axes at rest [m].
     place : ndarray, shape (n_vertices, 3)
         Places of the vertices in the cloud's frame [m].
     displacement_spread, place_spread : ndarray, shape (n_vertices, 3, k)
-        Square roots of the posterior covariance [m]; S S^T is that
-        of any vertices together.
+        Square roots S of the posterior covariance of any vertices, S S^T [m].
     model_error : float
-        Relative, by the vademecum's certificate and by what small strains leave out.
+        Relative error by the vademecum's certificate and by small strains.
     away : ndarray, shape (n_vertices,)
         Distance of each place from the nearest point of the cloud [m].
     within : float
         Bound of the rule, within which a place is determined [m].
     problems : tuple[str, ...]
-        Why the model does not explain the cloud, one line each; empty if it does.
+        Reasons why the model does not explain the cloud, one line each; empty if it does.
     notices : tuple[str, ...]
-        What else there is to know, one line each.
+        Further notices, one line each.
     """
 
     vademecum: Vademecum
@@ -128,24 +127,24 @@ class Registered:
 
     @property
     def displacement_deviation(self) -> FloatArray:
-        """Standard deviations along the axes, the model's error in them, (n_vertices, 3) [m]."""
+        """Standard deviations of displacement, model error included, (n_vertices, 3) [m]."""
         return self._deviation(self.displacement_spread)
 
     @property
     def place_deviation(self) -> FloatArray:
-        """The same of the place in the cloud's frame."""
+        """Standard deviations of the place in the cloud's frame, (n_vertices, 3) [m]."""
         return self._deviation(self.place_spread)
 
     @property
     def seen(self) -> FloatArray:
-        """Vertices less than 15 mm from a point of the cloud, ndarray of bool, (n_vertices,)."""
+        """Mask of vertices less than 15 mm from a point of the cloud, shape (n_vertices,)."""
         return np.asarray(self.away < SEEN)
 
     @property
     def model_deviation(self) -> FloatArray:
         """Standard deviation along each axis by the model's own error, (n_vertices,) [m].
 
-        The cloud makes up for it where it is near.
+        A near cloud reduces it.
         """
         size = np.linalg.norm(self.displacement, axis=1)
         mean = float(np.sqrt(np.mean(size**2)))
@@ -159,17 +158,17 @@ class Registered:
 
     @property
     def is_determined(self) -> FloatArray:
-        """Vertices whose place is known within the bound, ndarray of bool, (n_vertices,)."""
+        """Mask of vertices whose place is known within the bound, shape (n_vertices,)."""
         return np.asarray(self.interval <= self.within)
 
     @property
     def by_data(self) -> FloatArray:
-        """How far the cloud and not the prior decides on a place, 0 to 1, (n_vertices,) [-]."""
+        """Influence of the cloud, against the prior, on each place, 0 to 1, (n_vertices,) [-]."""
         variance = (self.place_spread**2).sum(axis=2).mean(axis=1) / UNDERSTATED**2
         return np.asarray(np.clip(1.0 - variance / self.fit.prior_deviation**2, 0.0, 1.0))
 
     def undetermined(self, estimates: Sequence[Estimate] = ()) -> tuple[str, ...]:
-        """What is not determined, one line each: of the part that is not seen, and targets."""
+        """Return notices of undetermined places, one line each: the unseen part, and targets."""
         lines = []
         hidden = np.logical_not(self.seen)
         if (
@@ -192,10 +191,11 @@ class Registered:
         return np.asarray(np.sqrt(square))
 
     def estimate(self, name: str, vertices: FloatArray, weights: FloatArray) -> Estimate:
-        """Of a weighted mean of vertices, whose weights sum to one.
+        """Return the estimate for a weighted mean of vertices, whose weights sum to one.
 
         Parameters
         ----------
+        name : str
         vertices : ndarray of int, shape (n,)
         weights : ndarray, shape (n,)
         """
@@ -217,7 +217,7 @@ class Registered:
         )
 
     def target_at(self, point: ArrayLike) -> Estimate:
-        """Where a point of the organ has gone.
+        """Return the present place of a point of the organ.
 
         Parameters
         ----------
@@ -241,7 +241,7 @@ class Registered:
         return found
 
     def targets(self) -> list[Estimate]:
-        """Where the middles of structures inside, such as tumours, have gone."""
+        """Return the present places of the middles of structures inside, e.g. tumours."""
         display, found = self.vademecum.display, []
         for name, faces in self.vademecum.structures.items():
             assert display is not None
@@ -251,12 +251,12 @@ class Registered:
         return found
 
     def largest(self) -> Estimate:
-        """Where the vertex that the deformation displaces most has gone."""
+        """Return the present place of the vertex that the deformation displaces most."""
         vertex = int((self.displacement**2).sum(axis=1).argmax())
         return self.estimate("largest displacement", np.array([vertex]), np.ones(1))
 
     def strongest_forces(self, n: int = 3) -> tuple[PlaceForce, ...]:
-        """Forces within two patch radii of the places that are pressed or pulled hardest."""
+        """Return forces within two patch radii of the places pressed or pulled hardest."""
         surface = self.vademecum.surface
         forces = self.fit.loads.at_positions(self.fit.coefficients)
         reach = 2.0 * surface.patch_radius
@@ -271,8 +271,8 @@ def register(
 ) -> Registered:
     """Bring an organ to a cloud of points on its deformed surface.
 
-    The response is that of small strains, also where a vademecum has the load's magnitude as a
-    coordinate; what that leaves out is part of the standard deviations.
+    The response is linear, even for a vademecum with large deformation. Its error at large strains
+    is part of the standard deviations.
 
     Parameters
     ----------

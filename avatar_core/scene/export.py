@@ -30,15 +30,20 @@ def export(
 
     Parameters
     ----------
-    path : .vtu or .xdmf
-    point : array_like, shape (3,) [m]; None for the middle of the accessible surface
-    force : float, along the inward normal, or array_like, shape (3,) [N]
-    n_modes : global ones, at most
+    vademecum : Vademecum
+    path : str or Path
+        File to write, .vtu or .xdmf.
+    point : array_like, shape (3,), or None
+        Point of the load [m]; None for the middle of the accessible surface.
+    force : float or array_like, shape (3,)
+        Force [N]; a number acts inward along the normal.
+    n_modes : int
+        Largest number of global modes.
 
     Returns
     -------
     meshio.Mesh
-        What was written; see :func:`organ_mesh`.
+        The written mesh; see :func:`organ_mesh`.
 
     Raises
     ------

@@ -44,7 +44,7 @@ class Tool:
     Raises
     ------
     SceneError
-        For a name that cannot be part of a topic's.
+        For a name that cannot be part of a topic's name.
     """
 
     name: str = "tool"
@@ -79,14 +79,22 @@ class SupportStiffness:
 
 @dataclass(frozen=True)
 class Scene:
-    """What is simulated, in SI units.
+    """Simulation of an organ: material, tools, outputs and effects, in SI units.
 
-    vademecum : file in the library's folder; "" for the one that is loaded
-    young_modulus, poisson_ratio, modes : None for those of the vademecum
-    supports : stiffnesses per area that are not those of the vademecum
-    resection : opened part of a cut; None for that of the vademecum
-    cloud : vertices that are sent
-    effects : each at most once, in any order; a tool with a jaw brings grasp along
+    Attributes
+    ----------
+    vademecum : str
+        File in the library's folder; "" for the one that is loaded.
+    young_modulus, poisson_ratio, modes : float or int or None
+        None for the vademecum's own.
+    supports : tuple[SupportStiffness, ...]
+        Stiffnesses per area that differ from the vademecum's.
+    resection : float or None
+        Opened part of a cut; None for the vademecum's own.
+    cloud : Cloud
+        Vertices that are sent.
+    effects : tuple[Effect, ...]
+        Effects, each at most once, in any order; a tool with a jaw adds grasp.
 
     Raises
     ------
@@ -149,7 +157,7 @@ class Scene:
             Grasp.require_jaw(tips)
 
     def effect(self, name: str) -> Effect | None:
-        """The effect of a name, if the scene has it."""
+        """Return the effect of a name, if the scene has it."""
         return next((effect for effect in self.effects if effect.name == name), None)
 
     @property
@@ -167,12 +175,12 @@ class Scene:
         return given | {SUPPORT + one.name: one.stiffness for one in self.supports}
 
     def require(self, vademecum: Vademecum) -> None:
-        """Refuse a vademecum that lacks what the scene needs, or answers it too wrongly.
+        """Refuse a vademecum that lacks an input of the scene, or whose errors are too large.
 
         Raises
         ------
         SceneError
-            Naming what is missing, or the error of a combination of effects above ``REFUSED``.
+            Naming the missing input, or the error of a combination of effects above ``REFUSED``.
         """
         for effect in self.effects:
             effect.require(vademecum)

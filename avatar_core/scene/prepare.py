@@ -114,20 +114,24 @@ def prepare(
     budget: Budget | None = None,
     period: float = PERIOD,
 ) -> ContactModel:
-    """The contact model of a scene, laid out and compiled; takes seconds, may fail.
+    """Return the contact model of a scene, laid out and compiled; takes seconds, may fail.
 
     Parameters
     ----------
     vademecum : Vademecum
-    scene : Scene; None for one spherical tip of 5 mm and the effects the vademecum calls for
-    budget : Budget; the fastest detail of the displacement that keeps it is shown, by the times in
-        the certificate. None shows all modes. The force always keeps all of them.
-    period : of the steps [s]
+    scene : Scene or None
+        None for one spherical tip of 5 mm and the effects that the vademecum requires.
+    budget : Budget or None
+        The fastest detail of the displacement that meets it is shown, by the times in the
+        certificate. None shows all modes. The force always keeps all of them.
+    period : float
+        Period of the steps [s].
 
     Raises
     ------
     AvatarError
-        What the vademecum cannot serve, or a budget that no detail meets, with the nearest two.
+        For a scene that the vademecum does not support. Also for a budget that no detail meets,
+        with the nearest two.
     """
     spec = scene_spec(vademecum, scene) if scene else default_spec(vademecum)
     detail = choose(spec.curve, budget).detail if budget else spec.finest

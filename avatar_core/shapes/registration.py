@@ -5,8 +5,8 @@
 W is the distortion of the tetrahedra against the aligned template. c_i is the point of the target
 nearest to surface vertex i, and p_j(x) the point of the template's surface nearest to target sample
 q_j. Distances count along the surface normal, and in both directions, so that thin lobes are
-filled. In the last stages, samples that are not reached pull the template straight to them, because
-springs along the normals of a tip's two faces do not lengthen the tip. The stiffness falls stage by
+filled. In the last stages, samples that are not reached pull the template straight to them. Springs
+along the normals of a tip's two faces would not lengthen the tip. The stiffness falls stage by
 stage. W is infinite on a flat tetrahedron and every step lowers the sum, so that no tetrahedron
 inverts.
 """

@@ -53,8 +53,8 @@ FRESH = 1001  # seed of loads that no certificate draws
 class AccuracyTimeSettings:
     """Sizes of the study.
 
-    They are numbers of vertices and of touches (certified, fresh and for the rivals), sizes of the
-    meshes, and other livers on which budgets are tried, with their touches.
+    They are numbers of vertices and of touches (certified, fresh and for the rivals), and sizes of
+    the meshes. Budgets are tried on other livers, with their touches.
     """
 
     n_vertices: int = 2850

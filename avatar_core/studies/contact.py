@@ -52,8 +52,8 @@ LIVERS = ("LiTS-20", "LiTS-50", "Amos-052", "Amos-086")  # not those of the cali
 class ContactSettings:
     """Sizes of the study.
 
-    They are livers by name, places and edges on each, tips and depths [m], and the places where a
-    ball is pressed on each of the ``invariant`` livers, which are also turned and remeshed.
+    They are livers by name, places and edges on each, tips and depths [m]. A ball is pressed at
+    further places on the ``invariant`` livers, which are also turned and remeshed.
     """
 
     livers: tuple[str, ...] = LIVERS

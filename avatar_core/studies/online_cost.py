@@ -93,7 +93,7 @@ def rival_rows(
 ) -> list[Row]:
     """Return the rivals with all vertices shown, on fresh loads, by processor time.
 
-    The table's time is the curve's time with all modes, times the ratio of both in turns: the curve
+    The table's time is the curve's time with all modes, times the ratio of both in turns. The curve
     was timed minutes before, on a machine with neighbours.
     """
     surface, mass = vademecum.surface, vademecum.mesh.lumped_mass

@@ -27,7 +27,7 @@ of up to 10 mm and 9 % for 20 mm. It fades by the factor h from 1.5 patch radii 
 continuously differentiable; farther off nothing changes.
 
 Below the surface the same function is taken at the distance rho from s. It is exact at the surface
-and falls with the depth as 1 / rho, like the field of Boussinesq's point force, which is up to
+and falls with the depth as 1 / rho. So does the field of Boussinesq's point force, which is up to
 twice as large right under the force. Only the displacement along n changes. The displacement along
 the surface is slight in nearly incompressible tissue and stays the patch's; so does the
 displacement by friction. In viscoelastic tissue the present dent is replaced, not the traces of

@@ -235,9 +235,9 @@ def tangential_compliance(model, data, t):  # type: ignore[no-untyped-def]
 def law_error(model, data, t):  # type: ignore[no-untyped-def]
     """Return the relative error of the force by the law alone.
 
-    Errors arise over tumours, where the surface is no plane, and where the organ is less soft at
-    the tip's lowest point than at the surface. They also arise where the gap grows by another
-    length than the tip moves: the force is then not that of its load.
+    Errors arise over tumours, and where the surface is no plane. They arise where the organ is less
+    soft at the tip's lowest point than at the surface. They also arise where the gap grows by
+    another length than the tip moves: the force is then not that of its load.
     """
     law = data.law
     plain = law.value[t, STIFFNESS] * np.exp(-law.shape[t])

@@ -1,10 +1,10 @@
-"""What a vademecum answers when its data are known as distributions only.
+"""Answers of a vademecum when its data are known as distributions only.
 
     known = {"young": uncertainty.Lognormal(5.3e3, 1.33)}
     bands = uncertainty.force_bands(vademecum, known, points, depths)
 
-Distributions of the material come in, bands of force and displacement go out, and with touches the
-distributions that measured forces leave.
+Distributions of the material come in. Bands of force and displacement go out; with touches, the
+posterior distributions after measured forces.
 """
 
 from __future__ import annotations

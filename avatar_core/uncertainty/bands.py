@@ -1,8 +1,8 @@
-"""Bands of force and displacement, and which parameter makes how much of them.
+"""Bands of force and displacement, and the contribution of each parameter.
 
-Draws are those of a Latin hypercube (McKay et al., Technometrics 21, 1979). A parameter's share is
-its first-order Sobol index (Sobol, Math. Comput. Simul. 55, 2001): the part of the variance of
-ln F that would go if the parameter were known.
+Draws are those of a Latin hypercube (McKay et al., Technometrics 21, 1979). A parameter's
+contribution is its first-order Sobol index (Sobol, Math. Comput. Simul. 55, 2001). It is the part
+of the variance of ln F that would vanish if the parameter were known.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Bands:
     moved : ndarray, shape (3, n_places, n_depths)
         Displacement of the target at 5, 50 and 95 % [m].
     shares : mapping of str to ndarray, shape (n_places, n_depths)
-        Share of each parameter that is not fixed in the variance of ln F [-].
+        First-order Sobol index of each uncertain parameter for ln F [-].
     """
 
     places: FloatArray
@@ -59,7 +59,7 @@ def force_bands(
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Bands:
-    """Bands of the force on a tip, and of the displacement of a target, for uncertain material.
+    """Return bands of the force on a tip, and of a target's displacement, for uncertain material.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def force_bands(
         Young's modulus and coordinates of the vademecum, by name. A parameter that is not given
         keeps the vademecum's value.
     points : array_like, shape (n_places, 3)
-        Where the tip presses [m]. The load position nearest to each point is taken.
+        Places where the tip presses [m]. The load position nearest to each point is taken.
     depths : array_like, shape (n_depths,)
         Depths of the tip below the surface, rising [m].
     tip : Tip, optional
@@ -81,7 +81,7 @@ def force_bands(
     seed : int
         Seed of the draws.
     progress : callable
-        Called with the number of materials that are done, and of all.
+        Called with the number of finished materials, and of all.
 
     Returns
     -------
@@ -92,7 +92,7 @@ def force_bands(
     LoadError
         If a point lies more than 5 mm off the accessible surface.
     ContactError
-        If the depths do not rise, the target lies outside the organ, or the tip feels nothing.
+        If the depths do not rise, the target lies outside the organ, or no force acts on the tip.
     CoordinateError
         If the vademecum has no such parameter.
     """
@@ -111,7 +111,7 @@ def force_bands(
 
 
 def _target(vademecum: Vademecum, point: ArrayLike | None) -> int:
-    """The vertex whose displacement is asked for."""
+    """Return the vertex whose displacement is asked for."""
     vertices = vademecum.mesh.vertices
     if point is not None:
         at = np.asarray(point, float)
@@ -138,7 +138,7 @@ def drawn(known: Mapping[str, Distribution], n: int, seed: int) -> dict[str, Flo
 def bands_of(
     table: ForceTable, known: Mapping[str, Distribution], n: int = 1000, seed: int = 0
 ) -> Bands:
-    """Return the bands that n draws span, and each parameter's share of the force's."""
+    """Return the bands that n draws span, and each parameter's Sobol index."""
     values, levels = drawn(known, n, seed), (LOW, 0.5, HIGH)
     return Bands(
         table.places,

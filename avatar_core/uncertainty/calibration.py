@@ -1,33 +1,33 @@
-"""What the measured forces of some touches tell about the material: the posterior of its values.
+"""Posterior of the material's values, from the measured forces of some touches.
 
-Each parameter p_k is a function of a standard normal number z_k by what was known before,
+Each parameter p_k is a function of a standard normal number z_k by its prior,
 
     p_k = Q_k(Phi(z_k)),
 
 Q_k its quantile function. With y the logarithms of the measured forces and f those of the computed
 ones, the most probable values minimize
 
-    (y - f(z))^T C^-1 (y - f(z)) + z^T z,
+    (y - f(z))^T C^-1 (y - f(z)) + z^T z.
 
-and the inverse of J^T C^-1 J + 1 there, J = df/dz, is the covariance of z (Tarantola, Inverse
-Problem Theory, SIAM 2005, section 3.2).
+The inverse of J^T C^-1 J + 1 there, J = df/dz, is the covariance of z (Tarantola, Inverse Problem
+Theory, SIAM 2005, section 3.2).
 
-C holds what is off about a force, each with its own reach:
+C holds the errors of a force, each with its own reach:
 
     a sample   the sensor: a part of the force, and a smallest force
     a touch    the vademecum's own error at that place, and by how much the surface lies deeper or
                higher than in the model, times d ln F / d depth
     all        the mesh that all forces share
 
-To the covariance comes what no force tells: a tumour's contrast and a support's stiffness are found
-for the bodies that the mesh makes of them. On three meshes of one organ they came out up to a
-quarter off, on each to one side, however many the touches.
+The covariance also contains the mesh error, which the forces cannot reveal. A tumour's contrast and
+a support's stiffness are found for the mesh's version of their bodies. On three meshes of one organ
+they came out up to a quarter off, on each to one side, however many the touches.
 
-The vademecum's error has long tails: at few places it is many times what it is elsewhere. It is
-taken for Student's t with nu degrees of freedom, as a touch that is d deviations off having an
-error whose variance is (nu + d^2) / (nu + 1) times the stated one (Lange, Little & Taylor, J. Am.
-Stat. Assoc. 84:881, 1989). Whether the model can have made the forces at all is judged by these d;
-see :mod:`avatar_core.uncertainty.fit_check`.
+The vademecum's error has long tails: at few places it is many times its usual size. It is taken for
+Student's t with nu degrees of freedom. The variance of a touch that is d deviations off is
+multiplied by (nu + d^2) / (nu + 1) (Lange, Little & Taylor, J. Am. Stat. Assoc. 84:881, 1989).
+These d also decide whether the model can have made the forces at all; see
+:mod:`avatar_core.uncertainty.fit_check`.
 """
 
 from __future__ import annotations
@@ -67,20 +67,20 @@ _TAIL = 4.0  # degrees of freedom of a vademecum's error over the stated one
 
 @dataclass(frozen=True)
 class TouchErrors:
-    """Standard deviations of what is off about a force.
+    """Standard deviations of the errors of a force.
 
     Attributes
     ----------
     sensor : float
-        Part of the force, of each sample.
+        Sensor's error, relative to the force of each sample.
     least : float
-        Least of each sample [N].
+        Least standard deviation of each sample [N].
     depth : float
         Depth of the surface's place at a touch [m].
     mesh : float
-        Part of the force, of all samples alike.
+        Error of the mesh relative to the force, the same for all samples.
     extent : float
-        Part of a contrast or a support's stiffness, by what the mesh makes of their bodies.
+        Error of the mesh for the extent of a tumour or support, relative to contrast or stiffness.
     """
 
     sensor: float = 0.02
@@ -169,20 +169,20 @@ class TouchTable:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What is known after a palpation.
+    """Posterior after a palpation.
 
     Attributes
     ----------
     known : Mapping[str, Distribution]
-        Before it, by parameter.
+        Prior distributions, by parameter.
     names : tuple[str, ...]
         Names of the parameters that were not fixed.
-    mean, covariance : ndarray
-        Mean and covariance of their standard normal numbers, shapes (n,) and (n, n).
+    mean, covariance : ndarray, shapes (n,) and (n, n)
+        Mean and covariance of their standard normal numbers.
     misfit : ndarray, shape (n_samples,)
         Misfit of ln F, measured less computed.
     deviations : ndarray, shape (n_touches,)
-        The same of each touch over its standard deviation.
+        Misfit of each touch over its standard deviation.
     probability : float
         Probability that so bad a fit comes by chance.
     """
@@ -218,9 +218,10 @@ class Calibration:
         return self.value(name, -NINETY), self.value(name, NINETY)
 
     def posterior(self, name: str) -> Distribution:
-        """A distribution about the most probable value, as wide as two thirds of the posterior.
+        """Return a lognormal distribution about the most probable value, as wide as the posterior.
 
-        It knows nothing of the other parameters; see :attr:`covariance`.
+        Its factor spans one standard deviation. It ignores correlations with other parameters; see
+        :attr:`covariance`.
         """
         factor = np.sqrt(self.value(name, 1.0) / self.value(name, -1.0))
         middle = self.value(name)
@@ -248,8 +249,8 @@ def calibrate(
     tip : Tip, optional
         The default is a sphere of 5 mm.
     known : mapping of str to Distribution, optional
-        What is known before, by name of a parameter. A parameter that is not given may lie
-        anywhere in the vademecum's range; Young's modulus lies between 500 Pa and 350 kPa.
+        Prior distributions, by name of a parameter. A parameter that is not given may lie anywhere
+        in the vademecum's range; Young's modulus lies between 500 Pa and 350 kPa.
     errors : TouchErrors, optional
         Standard deviations of sensor, surface and mesh.
 
@@ -373,7 +374,7 @@ def calibrated(
     """
     names = tuple(name for name, one in known.items() if not isinstance(one, Fixed))
     errors = errors or TouchErrors()
-    # What Young's modulus has taken of the mesh's error is no misfit.
+    # The part of the mesh's error in Young's modulus is no misfit.
     own = replace(errors, mesh=0.0) if "young" in names else errors
 
     def computed(z: FloatArray) -> FloatArray:

@@ -111,7 +111,10 @@ class LogUniform:
 
 @dataclass(frozen=True)
 class Lognormal:
-    """ln x is normal about ln median; two thirds lie within median / factor and median * factor."""
+    """Lognormal distribution: ln x is normal about ln median.
+
+    Two thirds lie within median / factor and median * factor.
+    """
 
     median: float
     factor: float
@@ -235,12 +238,12 @@ def distribution_file(value: str) -> Path:
 
 
 def read_distributions(file: Path) -> dict[str, Distribution]:
-    """What a YAML file says of parameters, by name; see ``params/uncertainty``.
+    """Read distributions of parameters from a YAML file, by name; see ``params/uncertainty``.
 
     Raises
     ------
     CoordinateError
-        For a file that cannot be read, has more than ``MAX_BYTES`` or says something else.
+        For a file that cannot be read, has more than ``MAX_BYTES`` or holds something else.
     """
     try:
         with opened(file, MAX_BYTES) as source:

@@ -1,18 +1,18 @@
 """Zero and lag of a force sensor, found from the forces along a path.
 
-The force f(t) that the vademecum gives along the same path tells both, whatever the true material.
+The vademecum's force f(t) along the same path gives both, whatever the true material.
 
 Zero. Where the tip is clearly off the organ, a sensor measures its own zero.
 
-Lag. An elastic organ's force F is a function of f in each touch, and f begins and ends at zero, so
-that
+Lag. An elastic organ's force F is a function of f in each touch, and f begins and ends at zero. The
+integral
 
     C(tau) = integral of F(t + tau) df(t)
 
-vanishes where tau is the lag of F, the maximum of the integral of F(t + tau) f(t) dt. Forces that
-lag give back more work than they took, which no tissue does: they are moved. Tissue that relaxes
-gives back less, C(0) > 0, as forces would that run ahead. These two are not told apart, so that the
-lost part of the work is returned: half of it is by how much the way in is too hard.
+therefore vanishes where tau is the lag of F, the maximum of the integral of F(t + tau) f(t) dt.
+Forces that lag give back more work than they took, which no tissue does: they are shifted. Tissue
+that relaxes gives back less, C(0) > 0, like forces that run ahead. These two cannot be told apart.
+The lost part of the work is therefore returned; half of it is the excess stiffness of the way in.
 """
 
 from __future__ import annotations

@@ -82,9 +82,15 @@ class CurvePoint:
 class Budget:
     """Limits on the error and the time of a step.
 
-    tolerance : on the relative error of ``quantity``, which 95 % of contacts keep
-    deadline : on the measured time that a step takes of the processor, which 99 % keep [s]; a
-        detail that was not timed keeps any
+    Attributes
+    ----------
+    tolerance : float
+        Largest relative error of ``quantity``, which 95 % of contacts stay below.
+    deadline : float
+        Largest measured processor time of a step, which 99 % stay below [s]. A detail that was not
+        timed meets any deadline.
+    quantity : Quantity
+        "l2" for the displacement or "force".
 
     Raises
     ------
@@ -106,7 +112,7 @@ class Budget:
                 raise AccuracyError(f"{name} is {value:g}; give a number above 0")
 
     def holds(self, point: CurvePoint) -> bool:
-        """Whether a point meets both."""
+        """Return whether a point meets both limits."""
         return point.error(self.quantity) <= self.tolerance and not point.p99 > self.deadline
 
 

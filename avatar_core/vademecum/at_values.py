@@ -1,4 +1,7 @@
-"""What of a vademecum depends on its coordinates (:mod:`avatar_core.vademecum.parametric`)."""
+"""The fields of a vademecum at values of its coordinates.
+
+See :mod:`avatar_core.vademecum.parametric`.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +56,7 @@ class Valued:
 def at_values(
     here: Valued, parametric: ParametricResponse | None, values: Mapping[str, float]
 ) -> Valued:
-    """The fields at chosen values; see :meth:`avatar_core.vademecum.model.Vademecum.at`."""
+    """Return the fields at chosen values; see :meth:`avatar_core.vademecum.model.Vademecum.at`."""
     given = dict(values)
     material = replace(here.material, young_modulus=given.pop("young", here.material.young_modulus))
     coordinates = parametric.coordinates if parametric else ()

@@ -53,17 +53,31 @@ class ContactSites:
 class Certificate:
     """Relative errors (fractions) on unseen loads, mean and worst, and the cost.
 
-    l2 : |u - u_FE| / |u_FE| over all vertices, mass-weighted, each load and direction
-    contact : |C - C_FE|_F / |C_FE|_F of the 3 x 3 compliance of the loaded patch
-    force : |F / F_FE - 1| of the normal force for an imposed normal indentation
-    tip_force : the same for a tip anywhere on the accessible faces, with the compliance that the
-        contact step uses, smoothed so that the force does not show the edges of the mesh
-    n_loads : unseen load positions; ``seed`` draws them
-    build_cpu_seconds : user + system time of everything, meshing and this certificate included
-    mesh_l2, mesh_contact : change of the reference when the mesh is refined once (NaN: not asked)
-    force_error : estimate of the force error at a place, calibrated on the same loads
-    contact_sites : errors of real tips against resolved contact, if asked for
-    curve : the same errors for coarser details of the displacement, and the time of a step
+    Attributes
+    ----------
+    l2_mean, l2_worst : float
+        |u - u_FE| / |u_FE| over all vertices, mass-weighted, each load and direction.
+    contact_mean, contact_worst : float
+        |C - C_FE|_F / |C_FE|_F of the 3 x 3 compliance of the loaded patch.
+    force_mean, force_worst : float
+        |F / F_FE - 1| of the normal force for an imposed normal indentation.
+    tip_force_mean, tip_force_worst : float
+        The same error for a tip anywhere on the accessible faces. The compliance is the contact
+        step's, smoothed so that the force does not show the mesh's edges.
+    n_loads, seed : int
+        Number of unseen load positions, and the seed that draws them.
+    modes : int
+        Number of modes of the certified displacement.
+    build_cpu_seconds : float
+        User + system time of everything, meshing and this certificate included [s].
+    mesh_l2, mesh_contact : float
+        Change of the reference when the mesh is refined once (NaN: not asked).
+    force_error : ForceError
+        Estimate of the force error at a place, calibrated on the same loads.
+    contact_sites : ContactSites
+        Errors of real tips against resolved contact, if asked for.
+    curve : AccuracyCurve or None
+        The same errors for coarser details of the displacement, and the time of a step.
     """
 
     l2_mean: float
@@ -86,6 +100,6 @@ class Certificate:
 
     @classmethod
     def unknown(cls) -> Certificate:
-        """A certificate without any figures."""
+        """Return a certificate without any figures."""
         nan = float("nan")
         return cls(nan, nan, nan, nan, nan, nan, nan, nan, 0, 0, 0)

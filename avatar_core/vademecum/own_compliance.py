@@ -16,14 +16,16 @@ from avatar_core.vademecum.parametric import combined, galerkin_load, stiffness_
 
 
 def own_compliance_at(vademecum: Vademecum, values: Mapping[str, float]) -> np.ndarray:
-    """Contact compliance at each load position of a load there, (n_positions, 3, 3) [m/N].
+    """Return the contact compliance of each load position with itself, (n_positions, 3, 3) [m/N].
 
-    Young's modulus is that for which the coordinates are computed. It takes a small part of the
+    Young's modulus is the one for which the coordinates are computed. It takes a small part of the
     time of :meth:`avatar_core.vademecum.model.Vademecum.at`.
 
     Parameters
     ----------
-    values : of all coordinates, by name; within their ranges
+    vademecum : Vademecum
+    values : Mapping[str, float]
+        Values of all coordinates, by name; within their ranges.
     """
     parametric, near = vademecum.parametric, vademecum.contact_near
     own = np.flatnonzero(near.position == near.target)
@@ -43,12 +45,12 @@ def own_compliance_at(vademecum: Vademecum, values: Mapping[str, float]) -> np.n
 
 
 def own_compliance(vademecum: Vademecum) -> np.ndarray:
-    """The same of a vademecum at the values that it has, (n_positions, 3, 3) [m/N]."""
+    """Return the same compliance at a vademecum's present values, (n_positions, 3, 3) [m/N]."""
     near = vademecum.contact_near
     return _own_compliance(vademecum.contact_load, near.block[near.position == near.target])
 
 
 def _own_compliance(load: np.ndarray, block: np.ndarray) -> np.ndarray:
-    """Y_j Y_j^T + the near block of j with itself."""
+    """Return Y_j Y_j^T + the near block of j with itself."""
     rows = load.reshape(len(block), 3, -1)
     return np.asarray(rows @ rows.swapaxes(1, 2) + block)

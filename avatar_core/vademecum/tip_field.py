@@ -5,9 +5,9 @@ inside). chi(p) is one where the closest point of the mesh is accessible and fad
 Both are evaluated by quadratic B-splines over a grid, whose second derivatives are bounded: a force
 made from them is continuous.
 
-The coefficients of phi make the spline take the distance at every grid point, after a kernel has
-removed the shortest waves: interpolated, these overshoot at edges and folds. The kernel is 2 G - G
-* G, G a Gaussian of half a spacing. It leaves planes and curved sides in place (its error is of
+The coefficients of phi make the spline take the distance at every grid point. A kernel first
+removes the shortest waves, which overshoot at edges and folds when interpolated. The kernel is 2 G
+- G * G, G a Gaussian of half a spacing. It leaves planes and curved sides in place (its error is of
 fourth order).
 
 On eight livers with facets of 4 to 10 mm, phi at the outline has a root mean square of 0.02 to 0.04

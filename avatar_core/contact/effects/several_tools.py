@@ -10,7 +10,7 @@ distance rho of their contacts
 
 Q of :mod:`avatar_core.fem.patch_on_plane`. C is the compliance of patches; a real tip moves the
 surface beside it differently. Like under the tip itself (:mod:`avatar_core.tips.law`), the effect
-of one patch on another on a half-space is taken off, and the effect of a tip put in its place,
+of one patch on another on a half-space is replaced by the effect of a tip,
 
     D += [1 / (pi sqrt(rho^2 + w_t^2 + w_t'^2)) - P(rho / R_p) / R_p] / E*,
 
