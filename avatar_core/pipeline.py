@@ -361,7 +361,7 @@ def _elasticity(
     return problem if options.coordinates or resection else problem.refining()
 
 
-@lru_cache(maxsize=1)  # a command says them before it builds
+@lru_cache(maxsize=1)  # a command prints them before it builds
 def notices_of(surface: SurfaceMesh, options: OrganOptions) -> tuple[str, ...]:
     """Return the notices before a build, one line each: what was read, and what is doubtful.
 

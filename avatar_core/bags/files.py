@@ -79,7 +79,7 @@ class OpenBag:
             while True:
                 try:
                     message = next(source, None)
-                except Exception as error:  # whatever a library raises for a damaged file
+                except Exception as error:  # any error of a library for a damaged file
                     self.notes.append(
                         f"{reader.path}: damaged after {n_read:,} messages of these topics "
                         f"({one_line(error, 120)}); those before it are used"

@@ -33,7 +33,7 @@ SENSOR = {f"{prefix}measured_cf": axes for prefix, axes in (("", "absolute"), ("
 _NEXT = 0.05  # from a pose to the wrenches before and after it, at most [s]
 _DIFFER = 0.9  # part of the stamps that are others than those before them, at least
 _BACK = 100_000_000  # by which a stamp may be before the one before it [ns]
-_ONE_CLOCK = 1_000_000_000  # between the delays of two topics that share a clock, at most [ns]
+_ONE_CLOCK = 1_000_000_000  # largest difference of the delays of two topics on one clock [ns]
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from avatar_core.offline.rule import Progress
 
-_FROM = 2.0  # from which the bar of what may be short is shown [s]
+_FROM = 2.0  # time after which the bar of a possibly short task is shown [s]
 
-# Parts of a build, of its stages; those of "contacts" are added.
+# Fractions of a build by stage; the fraction of "contacts" is added.
 _LINEAR = {"mesh": 0.1, "solve": 0.45, "modes": 0.2, "certify": 0.15, "time": 0.1}
 _LARGE = {
     "mesh": 0.02,

@@ -34,8 +34,8 @@ R = TypeVar("R")
 
 MAX_BYTES = 2 << 30
 RETURNED, RAISED, FAILED = "returned", "raised", "failed"  # with a value, our error, a line
-_START_SECONDS = 60.0  # to import what is called
-_WAITING = 10.0  # times what a call may compute, after which it waits for something in vain
+_START_SECONDS = 60.0  # limit of the import of a function
+_WAITING = 10.0  # multiple of a call's processor time after which it counts as stuck
 _LOOK = 0.2  # at the time it has computed [s]
 _STOP_SECONDS = 0.1  # to end before it is killed
 

@@ -34,12 +34,12 @@ OUT = kind(
 _S = str(MAX_STENCIL)
 DATA = kind(
     "Data",
-    # what a step is given
+    # inputs of a step
     tip=array("T 3"),  # sphere centres [m]
     orientation=array("T 4"),  # of the tools, x y z w; zero if it is not known
-    jaw=array("T", np.bool_),  # whether that of a tool is closed
+    jaw=array("T", np.bool_),  # whether the jaw of a tool is closed
     shown=array("1", np.int64),  # level of the modes that are shown
-    # what is kept between steps
+    # state between steps
     passage=array("T", np.int64),  # whether the tip entered through the surface
     seen=array("T 3"),  # last valid position of the tip in contact [m]
     force=array("T"),  # lambda [N]

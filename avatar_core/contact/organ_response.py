@@ -47,10 +47,9 @@ MAX_STENCIL = 27 * 6  # load positions that carry one tip, at most: six at each 
 # load positions and their weights; missed (n,), E* R_p times the interpolation error of C(s, s)
 TipCarriers = namedtuple("TipCarriers", ["shell", "normal", "carrier", "weight", "missed"])
 
-# row (nx, ny, nz) int32: the row of a grid point, -1 far from the surface; carrier (n_rows, 3 or
-# 6) int32 load positions and carrier_weight (n_rows, 3 or 6) float32;
-# self_compliance, smoothing (nx, ny, nz) float32, gamma_q [m/N] and the relative change by K,
-# K |gamma_0 / K gamma_0 - 1|
+# row (nx, ny, nz) int32: row of a grid point, -1 far from the surface. carrier (n_rows, 3 or 6)
+# int32: load positions; carrier_weight (n_rows, 3 or 6) float32. self_compliance (nx, ny, nz)
+# float32: gamma_q [m/N]. smoothing, alike: the relative change by K, K |gamma_0 / K gamma_0 - 1|
 TipResponse = namedtuple(
     "TipResponse", ["row", "carrier", "carrier_weight", "self_compliance", "smoothing"]
 )

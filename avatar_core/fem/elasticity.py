@@ -42,7 +42,9 @@ POISSON_RATIO_P2 = 0.49
 _TRIED = 6  # loads, of two positions, on which single precision is tried
 _BACKWARD = 1e-5  # imbalance in single precision, over the largest diagonal times displacement
 _REFINED = 1e-4  # last relative change of a refined solution, whose own error is its square
-SINGLE_ERROR = 1e-3  # relative, up to which single precision serves: modes leave six times it
+SINGLE_ERROR = (
+    1e-3  # largest relative error of single precision; that of the modes is six times as large
+)
 
 
 @dataclass(frozen=True)
@@ -397,7 +399,7 @@ class Elasticity:
         balanced = self.apply(displacement[:, :1].astype(float))[free]
         imbalance = np.abs(balanced - right[: len(free), :1]).max()
         allowed = most * np.abs(right[:, :1]).max()
-        if single:  # forces that nearly cancel drown in its rounding of what they are made of
+        if single:  # forces that nearly cancel are smaller than the rounding of their terms
             allowed += _BACKWARD * np.abs(self.diagonal * displacement[:, 0]).max()
         if not imbalance <= allowed:
             raise ConvergenceError(

@@ -23,8 +23,8 @@ from avatar_core.fem.elasticity import POISSON_RATIO_P2, Elasticity
 from avatar_core.fem.hyperelastic_materials import HyperelasticMaterial, determinant
 from avatar_core.geometry.mesh import TetMesh
 
-# Four points, one for each coefficient of the linear F of an element, so that nothing but a rigid
-# motion is free of energy; exact for the stiffness at rest.
+# Four points, one for each coefficient of the linear F of an element. Only a rigid motion is then
+# free of energy. The rule is exact for the stiffness at rest.
 _QUADRATURE_DEGREE = 2
 # Corners of the reference element: a strain that is linear in an element is extreme there.
 _CORNERS = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -115,7 +115,7 @@ class Hyperelasticity:
         """
         A = self.material.tangent(self.deformation_gradient(displacement))
         indices, indptr, slot = self._pattern
-        data = np.zeros(len(indices) + 1)  # the last one takes what the clamp holds
+        data = np.zeros(len(indices) + 1)  # the last entry collects those of clamped nodes
         _assemble(self.gradients, self.volumes, A, slot, data)
         n = len(self.free)
         return sp.csc_matrix((data[:-1], indices, indptr), shape=(n, n))

@@ -32,8 +32,8 @@ from avatar_core.geometry.mesh import Regions, TetMesh
 LEAST_PATCH_RADIUS = 12e-3  # [m]
 FARTHEST = 5e-3  # of a point from the accessible surface, to which it is then moved [m]
 LEAST_OPENNESS = 0.2  # length of the mean unit normal within R, below which a face carries no load
-# Mean edge, in patch radii, from which edges get a midpoint: linear interpolation between corners
-# leaves 9 % of the contact compliance at 0.6 (a small liver, Amos-052), with its square.
+# Mean edge, in patch radii, from which edges get a midpoint. Linear interpolation between corners
+# misses 9 % of the contact compliance at 0.6 (a small liver, Amos-052), and grows with its square.
 MIDPOINTS_FROM = 0.3
 MOST_POSITIONS = 6000  # with midpoints; the contact near field grows with their square
 
@@ -209,7 +209,7 @@ def load_surface(mesh: TetMesh, regions: Regions, patch_radius: float | None = N
             f"a patch of radius {patch_radius:g} m reaches around the organ, wherever it presses; "
             "take a smaller radius (12e-3: 12 mm)"
         )
-    # both sides of a cut share their load positions
+    # both sides of a cut have the same load positions
     vertices, corner = np.unique(mesh.joined[faces], return_inverse=True)
     corner = corner.reshape(-1, 3)
     a, b = np.unique(np.sort(corner[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0).T

@@ -34,7 +34,7 @@ from avatar_core.fem.triangles import subdivided_rule, triangle_shape
 from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.tip import Tip
 
-REACH = 1.4  # radius of the candidates over that of the contact on a half-space
+REACH = 1.4  # radius of the candidate surface over the contact radius on a half-space
 _FACING = 0.2  # least cosine of a face's normal to the axis
 _PIECES = 4  # of a face's edge, for the quadrature: the rim cuts faces
 _LEAST_AREA = 0.02  # of a hat within the rim, over the mean one

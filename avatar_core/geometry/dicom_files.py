@@ -10,7 +10,7 @@ import numpy as np
 from avatar_core.errors import SurfaceError
 from avatar_core.geometry.volumes import Segment, Volume, require_loadable
 
-_MAGIC = 128, b"DICM"  # where, and what a file of DICOM says there
+_MAGIC = 128, b"DICM"  # place and content of DICOM's signature
 _LOOKED_AT = 5  # files of a folder, one of which has to be DICOM
 # Errors of highdicom and pydicom: irregular slices, missing attributes, codecs that are not there.
 _UNREADABLE = (AttributeError, KeyError, NotImplementedError, RuntimeError, TypeError, ValueError)
@@ -63,7 +63,7 @@ def is_series(folder: Path) -> bool:
     try:
         files = sorted(path for path in folder.iterdir() if path.is_file())[:_LOOKED_AT]
         return any(_is_dicom(path) for path in files)
-    except OSError:  # not to be read, or gone
+    except OSError:  # unreadable, or deleted meanwhile
         return False
 
 

@@ -68,7 +68,7 @@ def _placement(organ: SurfaceMesh, lesion: SurfaceMesh) -> tuple[str, ...]:
             "organ's (--label 1,2)"
         )
     if share > _ALL and lesion.source_sha256 == organ.source_sha256 != "":
-        return ()  # which its reader has said
+        return ()  # reported by its reader
     out = "" if share > _ALL else f", reaching {reach:.0f} mm out"
     return (f"lesion {lesion.name}: {volume}, inside: {share:.0%}{out}",)
 

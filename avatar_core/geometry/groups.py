@@ -41,7 +41,7 @@ def read_groups(path: str | Path) -> dict[str, np.ndarray]:
             points = {name: np.asarray(groups[name], float) for name in groups.files}
         if any(p.shape[1:] != (3,) or not np.isfinite(p).all() for p in points.values()):
             raise ValueError("points are rows of three finite numbers")
-    except Exception as error:  # whatever numpy and zipfile raise of a damaged file
+    except Exception as error:  # any error of numpy and zipfile for a damaged file
         raise _unreadable(f"{path} ({one_line(error)})") from error
     return points
 

@@ -42,7 +42,7 @@ _TO_RAS = {  # of the spaces that NRRD names, in full and in short, the signs of
 }
 _NIFTI_MM = {1: 1e3, 2: 1.0, 3: 1e-3}  # length of the units of a header; 0, unknown, is mm
 _NRRD_MM = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "": 1.0, "???": 1.0}
-_APART = 0.5  # between the places that qform and sform give a voxel, from which on it is said [mm]
+_APART = 0.5  # least distance of a voxel by qform and by sform that gives a notice [mm]
 _OFF = 0.1  # from a whole number, at most, of a label
 _EXACT = 1e-3  # from a whole number, distance below which no notice is given
 

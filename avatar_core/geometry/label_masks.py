@@ -17,7 +17,7 @@ Mask = NDArray[np.bool_]
 Box = tuple[slice, slice, slice]
 
 _ENCLOSED = 0.5  # of the surface of a part, from which on the organ encloses it
-_CAVITY = 1.0  # the smallest that is said [ml]
+_CAVITY = 1.0  # smallest cavity in a notice [ml]
 # DICOM leaves out empty slices, so a cropped image touches round ends. Their outermost slice has
 # 0.33 of the area of the next one; a cut end has more than 0.6. A cut end also has a part of the
 # largest section, and more where both ends touch, as then the image was cropped.
@@ -28,7 +28,7 @@ _SIDES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior")
 def box_of(mask: Mask) -> Box:
     """Return the bounding box of a mask."""
     box = [slice(None)] * 3
-    for axis in (2, 1, 0):  # each looks at what is left by those before
+    for axis in (2, 1, 0):  # each axis within the box of those before
         used = mask[tuple(box)].any(axis=tuple(a for a in range(3) if a != axis))
         where = np.flatnonzero(used)
         box[axis] = slice(int(where[0]), int(where[-1]) + 1)

@@ -65,7 +65,7 @@ class Shedder:
             if self._calm >= self._patience and self.is_shedding:
                 self._level, self._calm, self._restored = self._level + 1, 0, True
             elif self._calm >= self._patience and self._restored:
-                self._patience, self._restored = PATIENCE, False  # the machine can serve it
+                self._patience, self._restored = PATIENCE, False  # the machine keeps up
         return self.modes
 
     def rest(self) -> int:

@@ -96,7 +96,7 @@ def build_vademecum(
     if with_body:
         space, load, trailing = _with_body(elasticity, loads, modes, n_global)
         body = body_response(elasticity, space)
-    trailing = short(trailing)  # what is near takes up the difference
+    trailing = short(trailing)  # the near field takes up the difference
     far = SeparatedField(elasticity.at_vertices(space), load)
     region, blocks = rule.regions(surface), blocks_to_display(elasticity.mesh, display)
     parts, errors = modes_of_regions(far, response, region, elasticity, rule, _half(progress, 0))

@@ -61,7 +61,7 @@ from avatar_core.vademecum.parametric import (
 )
 from avatar_core.vademecum.tip_field import TipField
 
-_LEAST_SAG = 1e-3  # relative, of what is left of a unit sag, that gets a function of its own
+_LEAST_SAG = 1e-3  # least relative remainder of a sag that gets its own function
 
 
 @dataclass(frozen=True, eq=False)

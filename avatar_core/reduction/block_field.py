@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 POINTS = 64  # of a block
 BLOCK = 3 * POINTS  # displacements that are summed together, within the first-level cache
 TOLERANCE = 2e-3  # root mean square of the relative error that blocks add to a load's displacement
-PART = 1e-2  # the same of what is but a part of a displacement, as large deformation adds it
-_BESIDE = 1e-3  # of what moves beside the loads: a sag is all that an untouched organ shows
+PART = 1e-2  # the same for a part of a displacement, e.g. by large deformation
+_BESIDE = 1e-3  # the same beside the loads: an untouched organ shows only its sag
 
 _NONE = -1  # in a place of a block that is not filled up
 _LARGEST = np.float32(32767)  # of int16: rounding costs 1 / 65536 of a mode's peak

@@ -35,8 +35,8 @@ from avatar_core.reduction.near_field import LocalBlocks, near_pairs, taper
 from avatar_core.reduction.operator import Operator, operator_of
 from avatar_core.reduction.separated import SeparatedField
 
-# In double and in single precision: part of the energy below which a direction is rounding, and
-# what the Gram matrix of orthonormal functions may be off.
+# In double and in single precision: fraction of the energy below which a direction is rounding,
+# and the allowed error of the Gram matrix of orthonormal functions.
 _DEPENDENT = {False: 1e-10, True: 1e-6}
 _ORTHONORMAL = {False: 1e-6, True: 0.05}
 WORST_OVER_MEAN = 2.0  # estimated, of the mean asked for; the true worst may be half as much again

@@ -27,9 +27,9 @@ MOST_BYTES = 1 << 30
 _BACKGROUND = 0.1  # distance of a point from the organ at rest beyond which it is none of it [m]
 _DOUBTED = 0.015  # distance of a cloud beyond which its axes are doubted [m]
 _TRIED = 300  # points of a cloud whose distances are looked at
-_MOST_EXTENT = 1.3  # of a cloud over that of the organ; a deformed organ is hardly larger
+_MOST_EXTENT = 1.3  # extent of a cloud over the organ's; a deformed organ is hardly larger
 _LEAST_EXTENT = 0.1  # the same, below which the unit is doubted
-_SAME = 1e-4  # of the extent, within which points count once: they tell the same again
+_SAME = 1e-4  # fraction of the extent within which points count as repeated
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(e[-+]?\d+)?", re.IGNORECASE)
 
 

@@ -170,7 +170,7 @@ _SHORTEST_SEARCH, _LONGEST_SEARCH = 4, 16  # steps in which places of forces are
 _SETTLED = 0.5e-3  # step of the surface that ends the search [m]
 _TRIES = 60  # of scales, the first time; a half of it later
 _MOST_ALTERNATIVES = 12
-_LEAST_WEIGHT = 0.01  # of an alternative, over that of the likeliest
+_LEAST_WEIGHT = 0.01  # of an alternative, over the likeliest
 _LEAST_SPREAD = 1e-7  # prior deviation of a turn [rad] and a shift [m] that are known
 
 

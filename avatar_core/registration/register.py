@@ -20,7 +20,7 @@ from avatar_core.vademecum.model import Vademecum
 
 # The true errors of synthetic clouds over the standard deviations that the posterior gives them:
 # loads are no Gaussian field, supports move, meshes differ. `avatar study registration` measures
-# what is covered.
+# the coverage.
 UNDERSTATED = 1.5
 # Relative error of small strains over the mean gradient of a displacement: point forces on a
 # neo-Hookean organ, up to 60 mm (`avatar study registration`).
@@ -31,12 +31,12 @@ _EVERY = 7  # vertices of the surface by which directions are judged
 _MOST_OUTLYING = 0.1
 _MOST_NOISE = 2.0  # noise that is found over that expected
 _MOST_MISMATCH = 0.6  # of the surface, over the noise expected; meshes that differ have 0.1 to 0.4
-# Of the deformation that is found. Right answers have up to 0.07 at displacements of 20 mm; where
-# loads have to explain what none of them caused, those that look like the cloud have 0.3.
+# Largest mean strain of a fitted deformation. Right answers have up to 0.07 at displacements of
+# 20 mm. Loads that fit a cloud which no load caused have 0.3.
 _MOST_STRAIN = 0.15
 SEEN = 0.015  # of a vertex from the nearest point of the cloud, at most [m]
 _OUT_OF_SIGHT = 0.05  # from which on nothing makes up for the model's error [m]
-_MOST_HIDDEN = 0.1  # part of what is not seen that may be undetermined in a good answer
+_MOST_HIDDEN = 0.1  # fraction of unseen vertices that may be undetermined in a good answer
 _INSIDE = 5e-3  # of a target from the organ at most [m]
 
 

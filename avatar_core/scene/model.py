@@ -33,7 +33,7 @@ CONFLICTS = (
     ),
 )
 
-# Part of topic names, so the rules are those of ROS 2.
+# Part of topic names, so the rules of ROS 2 hold.
 _TOOL_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 
 

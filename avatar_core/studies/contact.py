@@ -45,7 +45,7 @@ TIPS = (
     Tip("flat", 3e-3),
 )
 KINDS = ("drawn", "ridge", "hollow", "edge")
-LIVERS = ("LiTS-20", "LiTS-50", "Amos-052", "Amos-086")  # not those of the calibration
+LIVERS = ("LiTS-20", "LiTS-50", "Amos-052", "Amos-086")  # other livers than in the calibration
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 METHODS = ("vademecum", "rigid", "splines")
 _LIVER = "LiTS-4.obj"
-_FINER = 1.4  # vertices of the true mesh over those of the vademecum's
+_FINER = 1.4  # vertices of the true mesh over the vademecum's
 _ERRORS = (
     "Mean error over the whole organ, beside a rigid motion and thin-plate splines, by what "
     "deformed it; dotted: 20 %."

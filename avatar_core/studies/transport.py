@@ -295,7 +295,7 @@ def transport_row(surface: SurfaceMesh, base: PatientBase, options: PatientOptio
     vademecum = vademecum_of_reduced(problem, found, options)
     reduced_seconds = cpu_seconds() - start
     guesses = [_guess(problem, base, kind, options) for kind in WEIGHTINGS]
-    # a fresh problem, so that no factorization is shared
+    # a fresh problem, so that no factorization is reused
     truth = _Truth(patient_problem(surface, base, registration, mesh))
     errors, contact = truth.of_vademecum(vademecum)
     reduced, estimate = float(errors.mean()), found.history[-1].mean

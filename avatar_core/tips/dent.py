@@ -153,7 +153,7 @@ def _add_dent(  # type: ignore[no-untyped-def]
     delta, _, _, a = dent(model, data, t)
     far = _lay_springs(model, data, t, delta)
     s, n = data.point[t], data.normal[t]
-    # held in registers: what is read from an array is read again after every write to the field
+    # in registers: values of arrays are read again after every write to the field
     place, normal = (s[0], s[1], s[2]), (n[0], n[1], n[2])
     shares = (tip, patch * data.law.elastic[t] * data.law.value[t, TAKEN])
     contact = (a * a, delta, 1.0 / model.law.radius[t])

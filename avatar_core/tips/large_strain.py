@@ -26,7 +26,7 @@ from avatar_core.common.jit import fast
 from avatar_core.geometry.tip import Tip
 
 # nu, c_0 ... c_3, and s^3 at 1.5 R, by ``avatar study indentation``. Halved elements change the
-# force by 0.1 % at most from 0.25 R on, and the fit misses that of the elements by 0.3 %.
+# force by 0.1 % at most from 0.25 R on, and the fit misses the elements by 0.3 %.
 COEFFICIENTS = np.array(
     [
         [0.00, -0.16145, 0.07511, -0.05957, 0.01529, 1.915],

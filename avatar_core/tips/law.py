@@ -52,13 +52,13 @@ from avatar_core.tips.profile import INTERVALS, STIFFNESS, TAKEN, profile_of
 if TYPE_CHECKING:
     from avatar_core.fem.elasticity import Material
 
-# c E* R_p: what a patch sinks on a cube of elements of a liver's size. On a half-space it is
+# c E* R_p: depth of a patch on a cube of elements of a liver's size. On a half-space it is
 # P(0) = 0.7665 (:mod:`avatar_core.fem.patch_on_plane`).
 PATCH_ON_MESH = 0.75
-# Relative errors of the force: per |log s|; by what the gap's slope is off one; and by what the
-# organ's compliance changes over the depth. With the patch's error they cover nine in ten of the
-# contacts of balls that were resolved on LiTS-1, LiTS-4, LiTS-10 and Amos-007, at drawn places, on
-# ridges, in hollows and at edges each, and are 3.8 times the true error in the median.
+# Relative errors of the force: per |log s|; per deviation of the gap's slope from one; and per
+# change of the organ's compliance over the depth. With the patch's error they cover nine in ten
+# resolved contacts of balls on LiTS-1, LiTS-4, LiTS-10 and Amos-007. Places are drawn, on ridges,
+# in hollows and at edges. The median estimate is 3.8 times the true error.
 SHAPE_ERROR, SLOPE_ERROR, VARIATION_ERROR = 0.22, 1.2, 0.18
 TUMOUR_ERROR = 0.25  # of the force, per relative change of E* by a tumour underneath
 LEAST_CONTACT = 0.02  # contact radius over the tip's, where the tangent of a light touch is taken

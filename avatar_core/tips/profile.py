@@ -13,8 +13,8 @@ from numpy.polynomial.legendre import leggauss
 from avatar_core.geometry.tip import Tip
 
 INTERVALS = 256  # of the table
-STIFFNESS, TAKEN = range(2)  # what the law of a tip reads where it is
-LAST = 3.0  # atanh of the last contact radius over that of a sphere
+STIFFNESS, TAKEN = range(2)  # columns that a tip's law reads at its place
+LAST = 3.0  # atanh of the last contact radius over the sphere's radius
 
 
 def _contact_radius(tip: Tip, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -103,7 +103,7 @@ def force_bands(
         )
     centers, places = vademecum.surface.centers, []
     for point in np.asarray(points, float).reshape(-1, 3):
-        vademecum.surface.nearest(point)  # refuses what lies off the surface
+        vademecum.surface.nearest(point)  # refuses points off the surface
         places.append(int(np.argmin(np.linalg.norm(centers - point, axis=1))))
     all_known, vertex = known_of(vademecum, known), _target(vademecum, target)
     table = force_table(vademecum, tip or Tip(), places, deep.tolist(), vertex, progress)

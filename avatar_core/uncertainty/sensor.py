@@ -12,7 +12,8 @@ integral
 therefore vanishes where tau is the lag of F, the maximum of the integral of F(t + tau) f(t) dt.
 Forces that lag give back more work than they took, which no tissue does: they are shifted. Tissue
 that relaxes gives back less, C(0) > 0, like forces that run ahead. These two cannot be told apart.
-The lost part of the work is therefore returned; half of it is the excess stiffness of the way in.
+The lost part of the work is therefore returned; half of it estimates
+the excess of the forces on the way in.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ from avatar_core.vademecum.model import Vademecum
 _CLEAR = (
     1.5e-3  # between tip and surface, where nothing is touched: five deviations of its place [m]
 )
-_LEAST_OFF = 5  # samples off the organ that tell the zero
+_LEAST_OFF = 5  # samples off the organ that determine the zero
 _MOST_LAG, _COARSE, _FINE = 0.4, 0.01, 0.003  # that is looked for, and the steps to it [s]
 _LEAST_LAG = 2e-3  # lag below which forces are not shifted [s]
-_SAID = 0.01  # zero that is said [N]
+_SAID = 0.01  # least zero in a notice [N]
 _PAUSE = 0.1  # for which a sample stands, at most [s]
 
 

@@ -18,7 +18,7 @@ from avatar_core.errors import AccuracyError
 Quantity = Literal["l2", "force"]
 Cloud = Literal["surface", "volume", "off"]
 
-CONTENT = 0.95  # part of the loads that a certified error holds for
+CONTENT = 0.95  # fraction of the loads below a certified error
 LEVELS = (1, 2, 3, 4, 5, 6, 8)  # numbers of modes that are measured, beside all of them
 _CONFIDENCE = 0.95  # that it does, over draws of the loads that were measured
 

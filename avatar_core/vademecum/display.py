@@ -28,8 +28,8 @@ from avatar_core.reduction.block_field import Blocks, blocks_of
 
 ORGAN = "organ"  # the first part
 DISPLAYED = 8000  # vertices: of 24 bytes each, two cores carry a thousand clouds a second
-# Vertices of a structure. Two triangles of a ball meet at 3 degrees with the fewest, on the mean of
-# their edges, and look smooth; at 15 degrees on a lesion of 20 mm by marching cubes.
+# Vertices of a structure. With the fewest, two triangles of a ball meet at 3 degrees on average and
+# look smooth. On a lesion of 20 mm by marching cubes they meet at 15 degrees.
 FEWEST_OF_STRUCTURE, MOST_OF_STRUCTURE = 2000, 4000
 Triangles = tuple[np.ndarray, np.ndarray]  # vertices (n, 3) [m], faces (m, 3)
 

@@ -51,7 +51,7 @@ ROUND = 1.01  # depth over distance, up to which a side is round
 STEEPEST = 2.5  # depth over distance, at most: thin lobes
 MOST_STEPS = 12  # of the way, each by the distance that is left
 SMOOTHING = 0.5  # standard deviation of G, in spacings
-SHARED = (1e-3, 0.1)  # closest points [m] and components of normals that share one f
+SHARED = (1e-3, 0.1)  # differences of closest points [m] and normals below which f is the same
 FADING = 0.5  # distance beyond the accessible surface over which access fades, in patch radii
 
 TUMOUR_SMOOTHING = 1.0  # standard deviation of the kernel for f, in spacings

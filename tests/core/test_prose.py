@@ -11,7 +11,7 @@ import pytest
 
 from tests.helpers.paths import ROOT
 
-FOLDERS = ("avatar_ros", "tests")
+FOLDERS = ("avatar_core", "avatar_ros", "tests")
 INVERTED = re.compile(r"(Of|What|That which|The same of)\b[^?]*$")  # questions may begin so
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 

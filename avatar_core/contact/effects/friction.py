@@ -51,7 +51,7 @@ class Friction(Effect):
         slipped=array("T"),  # distance that the anchor slid in this period [m]
         matrix=array("3T 3T"),  # of the Newton steps
         rhs=array("3T"),  # [N]
-        give=array("T"),  # tangential compliance of the dent, less that of the patch [m/N]
+        give=array("T"),  # tangential compliance of the dent, less the patch's [m/N]
         stiffened=array("T"),  # by how much it fell in this period, at least 0 [m/N]
         best=array("T 3"),  # push of the Newton step with the least residual [N]
     )

@@ -96,7 +96,7 @@ def cases_on(vademecum: Vademecum) -> tuple[Case, ...]:
     cases = []
     for name, kind in EFFECTS.items():
         effect = _leaning(vademecum) if kind is Tilt else kind.example()
-        with suppress(SceneError):  # what this vademecum lacks
+        with suppress(SceneError):  # effects that this vademecum does not support
             effect.require(vademecum)
             cases.append((name, 2 if kind is SeveralTools else 1, (effect,)))
     return (*cases, (TWO_JAWS, 2, (Grasp(), SeveralTools())))
