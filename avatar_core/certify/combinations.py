@@ -21,7 +21,7 @@ from avatar_core.errors import ConvergenceError, EquilibriumError
 from avatar_core.fem.hyperelasticity import Hyperelasticity
 from avatar_core.fem.newton import NewtonRule, State, press
 from avatar_core.fem.patch_loads import patch_loads, patch_normals
-from avatar_core.vademecum.large_deformation import powers
+from avatar_core.vademecum.large_deformation import PUSH, powers
 from avatar_core.vademecum.model import Vademecum
 
 COMBINATIONS = ("oblique", "two tools", "gravity")
@@ -192,8 +192,8 @@ class _Site:
         """Return the depth that large deformation adds."""
         large = vademecum.large
         assert large is not None
-        reach = float(large.reach[self.positions].min())
-        return _DepthCurve(large.depth[:, self.positions] @ self.weights, reach)
+        reach = float(large.reach[PUSH, self.positions].min())
+        return _DepthCurve(large.depth[PUSH][:, self.positions] @ self.weights, reach)
 
 
 def _at_site(

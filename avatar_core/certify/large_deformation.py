@@ -1,8 +1,7 @@
-"""Errors of a vademecum with large deformation on unseen pushes.
+"""Errors of a vademecum with large deformation on unseen pushes and pulls.
 
 The truth is the full nonlinear finite element solution on the same mesh, by Newton's method, for
-patches centred at face centroids, pushed along the inward normal to depths that the build does not
-use.
+patches centred at face centroids, moved along the normal to depths that the build does not use.
 """
 
 from __future__ import annotations
@@ -19,15 +18,17 @@ from avatar_core.fem.hyperelasticity import Hyperelasticity
 from avatar_core.fem.newton import NewtonRule, press
 from avatar_core.fem.norms import relative_l2
 from avatar_core.fem.patch_loads import patch_loads, patch_normals
-from avatar_core.vademecum.large_deformation import LargeCertificate
+from avatar_core.vademecum.large_deformation import PUSH, LargeCertificate
 from avatar_core.vademecum.model import Vademecum
+
+_PUSHES_PER_PULL = 3
 
 
 @dataclass(frozen=True)
 class LargeRow:
-    """One push: errors at equal depth.
+    """One push or pull: errors at equal depth.
 
-    triangle : accessible face whose centroid is pushed; depth [m]
+    triangle : accessible face whose centroid is pushed; depth : inward, negative of a pull [m]
     l2 : |u - u_FE| / |u_FE|, mass-weighted; contact : |F / F_FE - 1|
     linear_l2, linear_contact : the same of the linear vademecum
     within : the push lies in the stored range
@@ -52,9 +53,10 @@ def certify_large(
 ) -> tuple[LargeCertificate, tuple[LargeRow, ...]]:
     """Push at random centroids to the depths 1/4, 1/2, 3/4 and 1 of what is stored there.
 
-    progress : called with the fraction that is done and the mean error so far
+    Each third of them is pulled as far too. Random factors of 0.9 to 1 keep the depths from being
+    round.
 
-    Random factors of 0.9 to 1 keep the depths from being round.
+    progress : called with the fraction that is done and the mean error so far
     """
     surface = vademecum.surface
     rng = np.random.default_rng(seed)
@@ -68,9 +70,12 @@ def certify_large(
         def pushed(fraction: float, done: int = done, error: float = error) -> None:
             progress((done + fraction) / len(sites), error)
 
-        found, lost = push_rows(vademecum, problem, int(triangle), depths, progress=pushed)
-        rows += found
-        n_lost += lost
+        for side in (1.0, -1.0)[: 2 if done % _PUSHES_PER_PULL == 0 else 1]:
+            found, lost = push_rows(
+                vademecum, problem, int(triangle), side * depths, progress=pushed
+            )
+            rows += found
+            n_lost += lost
         error = float(np.mean([row.l2 for row in rows] or [np.nan]))
         progress((done + 1) / len(sites), error)
     return summary(vademecum, rows, len(sites), n_lost), tuple(rows)
@@ -98,6 +103,7 @@ def push_rows(
 ) -> tuple[list[LargeRow], bool]:
     """Errors at a point of one face; whether equilibrium was lost within the stored range.
 
+    depths : all inward, or all negative [m]
     barycentric : of the point; the centroid by default
     progress : called with the fraction of the last depth that is reached
     """
@@ -105,24 +111,26 @@ def push_rows(
     place = np.array([barycentric])
     center = place @ surface.centers[surface.corners[triangle]]
     normal = patch_normals(vademecum.mesh, center, surface.patch_radius)[0]
-    load = patch_loads(problem.linear, center, surface.patch_radius) @ -normal
+    side = float(np.sign(depths[0]))
+    load = patch_loads(problem.linear, center, surface.patch_radius) @ (-side * normal)
     positions, weights = (x[0] for x in surface.weights(np.array([triangle]), place))
     linear, mass = replace(vademecum, large=None), vademecum.mesh.lumped_mass
     rows: list[LargeRow] = []
     rule = NewtonRule(exact_stability=False)
     try:
-        for state in press(problem, load, np.ones(1), list(depths), rule, progress=progress):
+        for state in press(problem, load, np.ones(1), list(abs(depths)), rule, progress=progress):
             truth = state.displacement[: 3 * len(vademecum.mesh.vertices)]
-            force, found = vademecum.push_to(positions, weights, state.depth)
-            plain, straight = linear.push_to(positions, weights, state.depth)
+            depth, exact = side * state.depth, side * float(state.force[0])
+            force, found = vademecum.push_to(positions, weights, depth)
+            plain, straight = linear.push_to(positions, weights, depth)
             rows.append(
                 LargeRow(
                     triangle,
-                    state.depth,
+                    depth,
                     float(relative_l2(found.displacement, truth, mass)),
-                    abs(force / float(state.force[0]) - 1.0),
+                    abs(force / exact - 1.0),
                     float(relative_l2(straight.displacement, truth, mass)),
-                    abs(plain / float(state.force[0]) - 1.0),
+                    abs(plain / exact - 1.0),
                     found.within,
                 )
             )
@@ -135,12 +143,13 @@ def push_rows(
 def summary(
     vademecum: Vademecum, rows: list[LargeRow], n_sites: int, n_lost: int
 ) -> LargeCertificate:
-    """Means and worst over the pushes within the stored range."""
+    """Means and worst over the pushes and pulls within the stored range."""
     assert vademecum.large is not None
-    inside = [row for row in rows if row.within]
+    inside = [row for row in rows if row.within and row.depth > 0.0]
+    pulled = [row for row in rows if row.within and row.depth < 0.0]
 
-    def values(name: str) -> FloatArray:
-        return np.array([getattr(row, name) for row in inside] or [np.nan])
+    def values(name: str, some: list[LargeRow] = inside) -> FloatArray:
+        return np.array([getattr(row, name) for row in some] or [np.nan])
 
     return LargeCertificate(
         l2_mean=float(values("l2").mean()),
@@ -153,6 +162,11 @@ def summary(
         n_pushes=len(inside),
         n_lost=n_lost,
         depth=float(values("depth").max()),
-        reach_median=float(np.median(vademecum.large.reach)),
-        reach_least=float(vademecum.large.reach.min()),
+        reach_median=float(np.median(vademecum.large.reach[PUSH])),
+        reach_least=float(vademecum.large.reach[PUSH].min()),
+        n_pulls=len(pulled),
+        pull_l2_mean=float(values("l2", pulled).mean()),
+        pull_l2_worst=float(values("l2", pulled).max()),
+        pull_contact_mean=float(values("contact", pulled).mean()),
+        pull_linear_l2_mean=float(values("linear_l2", pulled).mean()),
     )

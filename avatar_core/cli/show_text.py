@@ -109,11 +109,12 @@ def _show_point(point: CurvePoint) -> None:
 def _show_large(v: Vademecum) -> None:
     if v.large is None:
         return
-    reach = v.large.reach * 1e3
+    reach, pulled = v.large.reach * 1e3
     print(
         f"  large deformation, {v.large.material}: {v.large.terms.rank} modes at a place, linear "
         f"depth up to {reach.max():.0f} mm (half of the positions "
-        f"{sorted(reach)[len(reach) // 2]:.0f}, the least {reach.min():.0f})"
+        f"{sorted(reach)[len(reach) // 2]:.0f}, the least {reach.min():.0f}), pulled "
+        f"{sorted(pulled)[len(pulled) // 2]:.0f} mm"
     )
     c = v.large.certificate
     if c is None:
@@ -125,6 +126,11 @@ def _show_large(v: Vademecum) -> None:
     ):
         print(f"    {name:38s} {mean:8.2%}  {worst:8.2%}")
     print(f"    the linear vademecum: {c.linear_l2_mean:.1%}, {c.linear_contact_mean:.1%}")
+    if c.n_pulls:
+        print(
+            f"    {c.n_pulls} pulls: displacement {c.pull_l2_mean:.1%} (linear "
+            f"{c.pull_linear_l2_mean:.1%}), force {c.pull_contact_mean:.1%}"
+        )
     print("    the force, with another effect added linearly")
     for name, mean in (
         ("30 degrees off the normal", c.oblique_contact_mean),

@@ -20,7 +20,6 @@ import numpy as np
 from avatar_core.common.jit import entry, fast, inlined
 from avatar_core.contact.display import write_cloud
 from avatar_core.contact.effects.friction import force_on_tissue
-from avatar_core.contact.effects.grasp import is_held
 from avatar_core.contact.effects.large_deformation import add_nonlinear_load, powers_of_depth
 from avatar_core.contact.effects.respiration import shift_cloud
 from avatar_core.contact.effects.viscoelasticity import least_shown
@@ -113,9 +112,9 @@ def _load_regions(model, data, t):  # type: ignore[no-untyped-def]
     for i in range(data.n_nodes[t]):
         kept += _kept_weight(model, data, t, i)
     f0, f1, f2 = force_on_tissue(model, data, t)
-    second = third = 0.0
-    if model.large_deformation.on and not is_held(model, data, t):
-        second, third = powers_of_depth(data, t)
+    powers = (0.0, 0.0, 0)
+    if model.large_deformation.on:
+        powers = powers_of_depth(model, data, t)
     for i in range(data.n_nodes[t]):
         j, w = data.nodes[t, i], _kept_weight(model, data, t, i)
         if w != 0.0:
@@ -124,8 +123,8 @@ def _load_regions(model, data, t):  # type: ignore[no-untyped-def]
             if not model.viscoelasticity.on:
                 part = w / kept
                 _add_load(model, data, j, part * f0, part * f1, part * f2)
-            if second != 0.0 or third != 0.0:
-                add_nonlinear_load(model, data, r, j, w / kept, second, third)
+            if powers[0] != 0.0:
+                add_nonlinear_load(model, data, r, j, w / kept, powers)
 
 
 @inlined

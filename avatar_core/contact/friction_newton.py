@@ -19,7 +19,8 @@ from __future__ import annotations
 import numpy as np
 
 from avatar_core.common.jit import fast, inlined
-from avatar_core.contact.effects.grasp import is_held
+from avatar_core.contact.effects.grasp import is_held, missed, stiffness_times
+from avatar_core.contact.effects.large_deformation import bend_held
 from avatar_core.contact.tip_solver import added_depth
 
 STEPS = 7
@@ -170,22 +171,21 @@ def _linearise(model, data, t):  # type: ignore[no-untyped-def]
 @inlined
 def _linearise_held(model, data, t):  # type: ignore[no-untyped-def]
     """Write rows of a tool that holds tissue: dg_t + K sum_s!=t C_ts dg_s = K (y - u)."""
-    friction, k = data.friction, data.grasp.stiffness[t]
+    friction, row = data.friction, 3 * t
+    bend_held(model, data, t)
     u0, u1, u2 = patch_displacement(model, data, t)
-    y, square = friction.offset[t], 0.0
-    x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
-    for i in range(3):
-        residual = k[i, 0] * x0 + k[i, 1] * x1 + k[i, 2] * x2
-        friction.rhs[3 * t + i] = residual
-        square += residual * residual
-        for s in range(data.passage.shape[0]):
-            if s != t and data.active[s]:
-                b = friction.compliance[t, s]
-                for d in range(3):
-                    friction.matrix[3 * t + i, 3 * s + d] = (
-                        k[i, 0] * b[0, d] + k[i, 1] * b[1, d] + k[i, 2] * b[2, d]
-                    )
-    return square
+    x0, x1, x2 = missed(data, t, u0, u1, u2)
+    z0, z1, z2 = stiffness_times(data, t, x0, x1, x2)
+    friction.rhs[row], friction.rhs[row + 1], friction.rhs[row + 2] = z0, z1, z2
+    for s in range(data.passage.shape[0]):
+        if s != t and data.active[s]:
+            b = friction.compliance[t, s]
+            for d in range(3):
+                k0, k1, k2 = stiffness_times(data, t, b[0, d], b[1, d], b[2, d])
+                friction.matrix[row, 3 * s + d] = k0
+                friction.matrix[row + 1, 3 * s + d] = k1
+                friction.matrix[row + 2, 3 * s + d] = k2
+    return z0 * z0 + z1 * z1 + z2 * z2
 
 
 @inlined

@@ -11,6 +11,7 @@ import numpy as np
 from avatar_core.common.jit import fast, inlined
 from avatar_core.contact.effects.friction import NONE, SLIPS, STICKS, near_between, tangential_force
 from avatar_core.contact.effects.grasp import is_held, place_jaw, pull, stiffen_jaw
+from avatar_core.contact.effects.large_deformation import bend_held
 from avatar_core.contact.friction_newton import newton_steps, patch_displacement
 from avatar_core.contact.tip_solver import added_depth, solve_tip
 from avatar_core.tips.law import tangential_compliance
@@ -158,6 +159,7 @@ def _sweep(model, data):  # type: ignore[no-untyped-def]
         worst = 0.0
         for t in range(data.passage.shape[0]):
             if is_held(model, data, t):
+                bend_held(model, data, t)
                 u0, u1, u2 = patch_displacement(model, data, t)
                 change = pull(data, t, u0, u1, u2)
                 worst = max(worst, change)

@@ -42,7 +42,11 @@ from avatar_core.contact.effects.grasp import (
     write_held_force,
 )
 from avatar_core.contact.effects.inertia import advance_inertia, predict_inertia
-from avatar_core.contact.effects.large_deformation import add_nonlinear_force, sample_coefficients
+from avatar_core.contact.effects.large_deformation import (
+    add_nonlinear_force,
+    is_held_too_far,
+    sample_coefficients,
+)
 from avatar_core.contact.effects.respiration import to_organ_frame, to_world_frame
 from avatar_core.contact.effects.several_tools import couple_near_fields
 from avatar_core.contact.effects.viscoelasticity import (
@@ -209,6 +213,8 @@ def write_forces(model, data):  # type: ignore[no-untyped-def]
         if is_held(model, data, t):
             out.contact_tool[n] = t
             write_held_force(model, data, t, n)
+            if is_held_too_far(model, data, t) and out.status[t] == OK:
+                out.status[t] = EXTRAPOLATED
             add_torque(model, data, t)
             n += 1
             continue

@@ -2,8 +2,9 @@
 
 Every load position gets its own terms, from a linear solution each with the stiffness at rest:
 there are no training sites to choose and nothing to interpolate but what the linear vademecum
-interpolates too. Terms of fourth and fifth order are *economised*: within the reach A they are
-replaced by the two that are kept,
+interpolates too. The terms of a pull are those of the push with the sign of odd orders turned.
+Terms of fourth and fifth order are *economised*: within the reach A they are replaced by the two
+that are kept,
 
     x^4 ~ -0.431 x^2 + 1.392 x^3,   x^5 ~ -0.686 x^2 + 1.610 x^3,   x = a / A in [0, 1],
 
@@ -16,6 +17,7 @@ change of volume, 50 times too large.)
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import scipy.sparse as sp
@@ -41,6 +43,7 @@ _WORST_OVER_MEAN = 5.0  # of what the modes of a region may leave
 # x^4 and x^5 in x^2 and x^3 on [0, 1], and the largest error relative to x
 _ECONOMISED = np.array([[-0.43078, 1.39231], [-0.68586, 1.61050]])
 _LEFT = np.array([0.0385, 0.0754])
+_PULLED = (-1.0) ** np.arange(1, _ORDER + 1)  # of the terms, by powers of |a|
 
 
 @dataclass(frozen=True)
@@ -67,9 +70,11 @@ class LargeRule:
 class _Paths:
     """Terms of all load positions.
 
-    fields : ndarray float32, shape (2, n_positions, 3 n_vertices), V_k [m^(1-k)]
-    depth : ndarray, shape (2, n_positions), beta_k; reach : (n_positions,), a_max [m]
-    size : ndarray, shape (n_positions,), |u(a_max)| in L2
+    Of pushes, then of pulls.
+
+    fields : ndarray float32, shape (2, 2, n_positions, 3 n_vertices), V_k [m^(1-k)]
+    depth : ndarray, shape (2, 2, n_positions), beta_k; reach : (2, n_positions), a_max [m]
+    size : ndarray, shape (2, n_positions), |u(a_max)| in L2
     """
 
     fields: FloatArray
@@ -96,11 +101,12 @@ def with_large_deformation(
     rule = rule or LargeRule()
     paths = _follow(problem, vademecum.surface, rule, progress)
     region = vademecum.field.region
+    size = paths.size[..., None] / paths.reach[..., None] ** np.array(POWERS)
     regions, errors = separate_regions(
         region,
-        lambda positions: paths.fields[:, positions].transpose(2, 1, 0),
+        lambda positions: np.concatenate(paths.fields[:, :, positions]).transpose(2, 1, 0),
         RegionalRule(rule.mode_tolerance, _WORST_OVER_MEAN * rule.mode_tolerance, rule.max_modes),
-        paths.size[:, None] / paths.reach[:, None] ** np.array(POWERS),
+        np.hstack(list(size)),
         vademecum.mesh.lumped_mass,
     )
     volumes = vademecum.mesh.vertex_volumes
@@ -123,8 +129,8 @@ def _follow(
     n, n_vertices = surface.n_positions, len(problem.mesh.vertices)
     mass = problem.mesh.lumped_mass
     loads = patch_loads(problem.linear, surface.centers, surface.patch_radius).tocsc()
-    fields = np.empty((len(POWERS), n, 3 * n_vertices), np.float32)
-    depth, reach, size = np.empty((len(POWERS), n)), np.empty(n), np.empty(n)
+    fields = np.empty((2, len(POWERS), n, 3 * n_vertices), np.float32)
+    depth, reach, size = np.empty((2, len(POWERS), n)), np.empty((2, n)), np.empty((2, n))
     for first in range(0, n, _BATCH):
         batch = np.arange(first, min(first + _BATCH, n))
         inward = sp.block_diag([-surface.normals[[j]].T for j in batch], format="csc")
@@ -132,11 +138,12 @@ def _follow(
         terms = path_series(problem, force, _ORDER)
         average = np.einsum("xj,xj->j", force, terms[0])
         terms = terms / (average ** np.arange(1, _ORDER + 1)[:, None])[:, None]
-        for i, j in enumerate(batch):
-            beta = force[:, i] @ terms[:, :, i].T
-            reach[j], size[j] = _reach(problem, terms[:, :, i], beta, mass, rule)
-            fields[:, j] = economised(terms[:, : 3 * n_vertices, i], reach[j])
-            depth[:, j] = economised(beta, reach[j])
+        for (i, j), (side, turned) in product(enumerate(batch), enumerate((1.0, _PULLED))):
+            one = terms[:, :, i] * np.reshape(turned, (-1, 1))
+            beta = force[:, i] @ one.T
+            reach[side, j], size[side, j] = _reach(problem, one, beta, mass, rule)
+            fields[side, :, j] = economised(one[:, : 3 * n_vertices], reach[side, j])
+            depth[side, :, j] = economised(beta, reach[side, j])
         progress("large", (batch[-1] + 1) / n, NO_ERROR)
     return _Paths(fields, depth, reach, size)
 
@@ -155,8 +162,9 @@ def _reach(
 ) -> tuple[float, float]:
     """Largest linear depth up to ``max_push`` at which two terms do, and |u| there in L2.
 
-    terms : ndarray, shape (5, 3 n_nodes); beta : shape (5,), their displacement of the patch
+    terms : ndarray, shape (5, 3 n_nodes); beta : shape (5,), their inward depth of the patch
     """
+    beta = np.sign(beta[0]) * beta
     at_vertices = terms[:, : len(mass)]
     inner = (at_vertices * mass) @ at_vertices.T
     a = np.linspace(0.0, _linear_depth(beta, rule), 61)[1:]

@@ -1,15 +1,16 @@
 """Load magnitude as a coordinate: what large deformation adds to the linear response.
 
-A tip presses with a force f along the inward normal. With the linear depth a = gamma(s) f of its
-patch, gamma = n . C(s, s) n, the organ moves by
+A tip presses with a force f along the inward normal; f < 0 where a jaw pulls. With the linear depth
+a = gamma(s) f of its patch, gamma = n . C(s, s) n, the organ moves by
 
-    u(x, s, a) = a u_1(x, s) / gamma(s) + sum_k a^k V_k(x, s),      k = 2, 3
-    d(s, a)    = a + sum_k beta_k(s) a^k,
+    u(x, s, a) = a u_1(x, s) / gamma(s) + sum_k |a|^k V_k(x, s),      k = 2, 3
+    d(s, a)    = a + sum_k beta_k(s) |a|^k,
 
-u_1 the linear vademecum, d the depth that is really reached. V_k and beta_k are the terms of the
+u_1 the linear vademecum, d the depth that is really reached. V_k and beta_k are terms of the
 asymptotic-numerical series (:mod:`avatar_core.reduction.asymptotic_series`), separated region by
-region of the load surface. They hold up to a_max(s); beyond, both continue tangentially. As stress
-is proportional to Young's modulus, V_k and beta_k do not depend on it.
+region of the load surface. Pushes and pulls have terms of their own, as two terms stand for four.
+They hold up to |a| = a_max(s); beyond, both continue tangentially. As stress is proportional to
+Young's modulus, V_k and beta_k do not depend on it.
 
 Only the response of a patch to its own normal force is nonlinear; coupling between patches and
 forces along the surface stay linear. :mod:`avatar_core.certify.combinations` measures the
@@ -34,17 +35,19 @@ from avatar_core.fem.hyperelastic_materials import (
 from avatar_core.reduction.block_field import BlockField, Blocks
 
 POWERS = (2, 3)
+PUSH, PULL = 0, 1  # sides of a = 0
 
 LargeMaterial = Literal["neo-hookean", "st-venant-kirchhoff"]
 
 
 @dataclass(frozen=True)
 class LargeCertificate:
-    """Errors over all pushes within the stored range.
+    """Errors over all pushes and pulls within the stored range.
 
     n_sites, n_pushes : that could be compared; n_lost : sites where equilibrium was lost before
         the range ended
     depth : the deepest push compared [m]
+    n_pulls, pull_l2_mean, pull_l2_worst, pull_contact_mean, pull_linear_l2_mean : of outward forces
     oblique_contact_mean, two_tools_contact_mean, gravity_contact_mean : of the force, where other
         effects are added (:mod:`avatar_core.certify.combinations`); NaN: not measured
     """
@@ -64,14 +67,19 @@ class LargeCertificate:
     oblique_contact_mean: float = float("nan")
     two_tools_contact_mean: float = float("nan")
     gravity_contact_mean: float = float("nan")
+    n_pulls: int = 0
+    pull_l2_mean: float = float("nan")
+    pull_l2_worst: float = float("nan")
+    pull_contact_mean: float = float("nan")
+    pull_linear_l2_mean: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
 class Push:
-    """An organ pushed by a force along the inward normal.
+    """An organ pushed by a force along the inward normal, or pulled by a negative one.
 
     displacement : ndarray, shape (3 n_vertices,) [m]
-    depth : of the patch [m]
+    depth : of the patch, inward [m]
     within : the force lies in the range that was computed
     """
 
@@ -85,9 +93,9 @@ class LargeDeformation:
     """The terms of second and third order; k counts them.
 
     material : of the large strains; its small ones are those of the vademecum
-    terms : BlockField, V_2 and V_3 as its two loads at a position [m^(1-k)]
-    depth : ndarray, shape (2, n_positions), beta_k [m^(1-k)]
-    reach : ndarray, shape (n_positions,), a_max [m]
+    terms : BlockField, V_2 and V_3 of pushes, then of pulls, its loads at a position [m^(1-k)]
+    depth : ndarray, shape (2, 2, n_positions), beta_k of pushes and of pulls [m^(1-k)]
+    reach : ndarray, shape (2, n_positions), a_max of pushes and of pulls [m]
     certificate : LargeCertificate or None
     """
 
@@ -112,12 +120,13 @@ class LargeDeformation:
         blocks : of the vademecum
         positions, weights : ndarray, shape (n,), of the point
         """
-        reach = float(self.reach[positions].min())
-        power = powers(linear.depth, reach)
-        bent = blocks.at_vertices(self.terms.combined(positions, weights)) @ power
-        displacement = linear.displacement + bent
-        depth = linear.depth + float(power @ (self.depth[:, positions] @ weights))
-        return Push(displacement, depth, linear.depth <= reach)
+        side, size = (PUSH if linear.depth >= 0.0 else PULL), abs(linear.depth)
+        reach = float(self.reach[side, positions].min())
+        power = powers(size, reach)
+        terms = self.terms.combined(positions, weights)[..., 2 * side : 2 * side + 2]
+        displacement = linear.displacement + blocks.at_vertices(terms) @ power
+        depth = linear.depth + float(power @ (self.depth[side][:, positions] @ weights))
+        return Push(displacement, depth, size <= reach)
 
 
 def hyperelastic(name: str, linear: Material) -> HyperelasticMaterial:
@@ -138,6 +147,6 @@ def hyperelastic(name: str, linear: Material) -> HyperelasticMaterial:
 
 
 def powers(a: float, reach: float) -> FloatArray:
-    """a^k up to the reach and tangentially beyond, k = 2, 3."""
+    """a^k of a >= 0 up to the reach and tangentially beyond, k = 2, 3."""
     inside = min(a, reach)
     return np.array([inside**k + k * inside ** (k - 1) * (a - inside) for k in POWERS])

@@ -139,7 +139,7 @@ class VademecumInfo:
     build_cpu_seconds: float
 
 
-SCHEMA_VERSION = "6.1"
+SCHEMA_VERSION = "6.2"
 
 
 @dataclass(frozen=True)
@@ -242,7 +242,7 @@ class Vademecum:
         Parameters
         ----------
         positions, weights : ndarray, shape (n,), as of :meth:`displacement`
-        force : f >= 0 [N]
+        force : f, negative to pull [N]
         """
         inward = -weights @ self.surface.normals[positions]
         inward /= np.linalg.norm(inward)
@@ -256,7 +256,7 @@ class Vademecum:
     def push_to(
         self, positions: np.ndarray, weights: np.ndarray, depth: float
     ) -> tuple[float, Push]:
-        """The force [N] that moves the patch by a depth [m], by Newton's method, and its push.
+        """Force [N] that moves the patch inward by a depth [m], by Newton's method, and its push.
 
         Raises
         ------
@@ -266,7 +266,7 @@ class Vademecum:
         force = depth / self.push(positions, weights, 1e-9).depth * 1e-9
         for _ in range(30):
             found, step = self.push(positions, weights, force), 1e-6 * force
-            if abs(found.depth - depth) <= 1e-9 * depth:
+            if abs(found.depth - depth) <= 1e-9 * abs(depth):
                 return force, found
             slope = (self.push(positions, weights, force + step).depth - found.depth) / step
             force += (depth - found.depth) / slope
@@ -277,8 +277,8 @@ class Vademecum:
     def displacement_at(self, point: ArrayLike, force: ArrayLike) -> np.ndarray:
         """Displacement of all vertices under a force at a point, shape (n_vertices, 3) [m].
 
-        Where the vademecum holds large deformation, the part of the force that presses deforms
-        the organ nonlinearly; the part that pulls or drags is added linearly.
+        Where the vademecum holds large deformation, the part of the force along the normal deforms
+        the organ nonlinearly; the part along the surface is added linearly.
 
         Parameters
         ----------
@@ -295,7 +295,7 @@ class Vademecum:
         if given.size not in (1, 3) or not np.isfinite(given).all():
             raise LoadError("a force is one or three finite numbers; give newtons")
         vector = -given[0] * place.normal if given.size == 1 else given
-        pressing = max(0.0, -float(vector @ place.normal))
+        pressing = -float(vector @ place.normal)
         rest = vector + pressing * place.normal
         pressed = self.push(place.positions, place.weights, pressing).displacement
         dragged = self.displacement(place.positions, place.weights) @ rest

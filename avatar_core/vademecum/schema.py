@@ -71,14 +71,14 @@ _OUTLINE: Shapes = {
 }
 _LARGE: Shapes = {
     "large/terms/region": "i: positions",
-    "large/terms/load": "f: positions 2 large_most",
+    "large/terms/load": "f: positions 4 large_most",
     "large/terms/count": "i: field_parts",
     "large/terms/space": "s: large_modes 192",
     "large/terms/core": "f: large_modes large_most",
     "large/terms/level": "i: large_modes",
     "large/terms/start": "i: field_parts block_starts",
-    "large/depth": "f: 2 positions",
-    "large/reach": "f: positions",
+    "large/depth": "f: 2 2 positions",
+    "large/reach": "f: 2 positions",
 }
 _DISPLAY: Shapes = {
     "display/vertices": "f: displayed 3",

@@ -1,6 +1,6 @@
 """Vademecums on disk: HDF5 with schema version and checksum.
 
-Layout (schema 6.1), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
+Layout (schema 6.2), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
 ``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
 in sorted order and over the JSON attributes), and the JSON attributes ``material``,
 ``provenance``, ``convergence``, ``certificate`` and ``accuracy``, its curve; those of the parts
@@ -48,8 +48,8 @@ attribute ``supports``, their names and stiffnesses [N/m^3]; one that is cut
 one with large deformation the JSON attribute
 ``large`` (material, certificate) and, for k = 2, 3,
 
-    large/terms/..., load (n_s, 2, most) [m^(1-k)], as of field
-    large/depth (2, n_s) [m^(1-k)]       large/reach (n_s,) [m]
+    large/terms/..., load (n_s, 4, most) [m^(1-k)], as of field: of pushes, then of pulls
+    large/depth (2, 2, n_s) [m^(1-k)]    large/reach (2, n_s) [m]
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ def flat_organ(
     }
     if neo_hookean is not None:
         constants["large_deformation"] = LargeDeformation.Constants(
-            np.zeros((3, *shape), single), np.zeros((1, 2, 0), single), np.zeros(2, np.int64)
+            np.zeros((6, *shape), single), np.zeros((1, 4, 0), single), np.zeros(2, np.int64)
         )
     arrays = MODEL(
         distance=distance.astype(single),

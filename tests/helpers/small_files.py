@@ -194,8 +194,8 @@ def _large(rng: np.random.Generator, vademecum: Vademecum) -> LargeDeformation:
     n, powers = len(vademecum.surface.centers), len(POWERS)
     return LargeDeformation(
         "neo-hookean",
-        _block_field(rng, vademecum.field.region, powers, 0),
-        np.zeros((powers, n)),
-        np.full(n, 0.01),
+        _block_field(rng, vademecum.field.region, 2 * powers, 0),
+        np.zeros((2, powers, n)),
+        np.full((2, n), 0.01),
         LargeCertificate(0.02, 0.05, 0.01, 0.04, 0.1, 0.1, 3, 9, 0, 0.01, 0.01, 0.01),
     )

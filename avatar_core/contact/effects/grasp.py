@@ -10,8 +10,9 @@ neighbourhood (:mod:`avatar_core.tips.law`), and u the displacement by all other
 is bonded to a half-space yields by 1 / (2 E* a) along n, and along the surface by
 (2 - nu) / (8 G a) = rho / (2 E* a), rho = (2 - nu) / (2 (1 - nu)) (Mindlin, J. Appl. Mech. 16:259,
 1949; exact without friction, and for nu = 1/2). All tools are solved for together, which is the
-capacitance matrix of James & Pai (SIGGRAPH 1999). As C is symmetric and s stays, the force is the
-derivative of one energy: no closed path gains.
+capacitance matrix of James & Pai (SIGGRAPH 1999). With large deformation, u has the added depth
+-n k h(a), a = -gamma n . g, of :mod:`avatar_core.contact.effects.large_deformation`. As C is
+symmetric and s stays, the force is the derivative of one energy: no closed path gains.
 
 It lets go when the jaw opens, or for good until then when the force exceeds what its friction
 holds. The tool touches nothing then until it has been outside: at depth, it would release energy
@@ -37,7 +38,7 @@ from avatar_core.geometry.tip import Tip
 from avatar_core.tips.profile import STIFFNESS, TAKEN
 
 OK, INVALID_POSE = int(Status.OK), int(Status.INVALID_POSE)  # numba takes plain numbers
-EXTRAPOLATED, SLIPPED = int(Status.EXTRAPOLATED), int(Status.SLIPPED)
+SLIPPED = int(Status.SLIPPED)
 
 REACH = 2e-3  # of a jaw that closes above the surface, and
 DEEPEST = 5e-3  # below it [m]
@@ -70,6 +71,7 @@ class Grasp(Effect):
         start=array("T 3"),  # of the tool at zero force, less u there,
         now=array("T 3"),  # and of the tool when that was last known [m]
         stiffness=array("T 3 3"),  # the inverse of the law's matrix [N/m]
+        bent=array("T 2"),  # inward depth by large deformation [m], its derivative by force [m/N]
     )
     superposed: ClassVar[bool] = True
 
@@ -229,14 +231,34 @@ def place_jaw(data, t, u0, u1, u2):  # type: ignore[no-untyped-def]
 @fast
 def pull(data, t, u0, u1, u2):  # type: ignore[no-untyped-def]
     """Correct g by what the patch misses y; returns the largest part of that [m]."""
-    k, y, g = data.grasp.stiffness[t], data.friction.offset[t], data.friction.push[t]
-    x0, x1, x2 = y[0] - u0, y[1] - u1, y[2] - u2
-    square = 0.0
-    for i in range(3):
-        g[i] += k[i, 0] * x0 + k[i, 1] * x1 + k[i, 2] * x2
-        square += g[i] * g[i]
-    data.force[t] = np.sqrt(square)
+    g = data.friction.push[t]
+    x0, x1, x2 = missed(data, t, u0, u1, u2)
+    z0, z1, z2 = stiffness_times(data, t, x0, x1, x2)
+    g[0], g[1], g[2] = g[0] + z0, g[1] + z1, g[2] + z2
+    data.force[t] = np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
     return max(abs(x0), abs(x1), abs(x2))
+
+
+@inlined
+def missed(data, t, u0, u1, u2):  # type: ignore[no-untyped-def]
+    """Part of y that the patch has not moved, u its displacement without large deformation [m]."""
+    y, n, depth = data.friction.offset[t], data.normal[t], data.grasp.bent[t, 0]
+    return y[0] - u0 + n[0] * depth, y[1] - u1 + n[1] * depth, y[2] - u2 + n[2] * depth
+
+
+@fast
+def stiffness_times(data, t, x0, x1, x2):  # type: ignore[no-untyped-def]
+    """[K^-1 + tau n n^T]^-1 x, tau the derivative of the bent depth (Sherman & Morrison, 1950)."""
+    k, n, tau = data.grasp.stiffness[t], data.normal[t], data.grasp.bent[t, 1]
+    w0 = k[0, 0] * n[0] + k[0, 1] * n[1] + k[0, 2] * n[2]
+    w1 = k[1, 0] * n[0] + k[1, 1] * n[1] + k[1, 2] * n[2]
+    w2 = k[2, 0] * n[0] + k[2, 1] * n[1] + k[2, 2] * n[2]
+    less = tau * (w0 * x0 + w1 * x1 + w2 * x2) / (1.0 + tau * (w0 * n[0] + w1 * n[1] + w2 * n[2]))
+    return (
+        k[0, 0] * x0 + k[0, 1] * x1 + k[0, 2] * x2 - less * w0,
+        k[1, 0] * x0 + k[1, 1] * x1 + k[1, 2] * x2 - less * w1,
+        k[2, 0] * x0 + k[2, 1] * x1 + k[2, 2] * x2 - less * w2,
+    )
 
 
 @fast
@@ -256,26 +278,38 @@ def hold_or_slip(model, data):  # type: ignore[no-untyped-def]
 def write_held_force(model, data, t, n):  # type: ignore[no-untyped-def]
     """The force on a tool that holds tissue, and its contact, number n."""
     out, g, y = data.out, data.friction.push[t], data.friction.offset[t]
-    square = 0.0
     for d in range(3):
         out.contact_position[n, d] = data.point[t, d] + y[d]
         out.contact_normal[n, d] = data.normal[t, d]
         if out.status[t] != INVALID_POSE:
             out.force[t, d] = -g[d]
         out.contact_force[n, d] = out.force[t, d]
-        square += y[d] * y[d]
     out.contact_penetration[n] = 0.0
-    if out.status[t] == OK and square > FARTHEST * FARTHEST:
-        out.status[t] = EXTRAPOLATED
+
+
+@inlined
+def linearly_moved(model, data, t):  # type: ignore[no-untyped-def]
+    """Displacement of a held tool to which the law responds linearly [m].
+
+    With large deformation, what the patch moves along the normal is not counted.
+    """
+    y, n, patch = data.friction.offset[t], data.normal[t], 0.0
+    if model.large_deformation.on:
+        g, own = data.friction.push[t], data.self_compliance[t] - data.law.value[t, TAKEN]
+        patch = own * (g[0] * n[0] + g[1] * n[1] + g[2] * n[2]) - data.grasp.bent[t, 0]
+    square = 0.0
+    for d in range(3):
+        square += (y[d] - patch * n[d]) ** 2
+    return np.sqrt(square)
 
 
 @fast
 def held_error(model, data, t):  # type: ignore[no-untyped-def]
     """Relative error of the force of a held tool: of the patch, the disc, and small strains."""
-    y, c = data.friction.offset[t], data.friction.compliance[t, t]
+    c = data.friction.compliance[t, t]
     patch = value_in_cell(
         model.force_error, cell_at(model.origin, model.spacing[0], data.grasp.place[t])
     )
     part = min(data.self_compliance[t] * 3.0 / (c[0, 0] + c[1, 1] + c[2, 2]), 1.0)
-    moved = np.sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
-    return part * patch + model.law.error_factor[0] * LAW_ERROR + STRETCH_ERROR * moved
+    stretch = STRETCH_ERROR * linearly_moved(model, data, t)
+    return part * patch + model.law.error_factor[0] * LAW_ERROR + stretch

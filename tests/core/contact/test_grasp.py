@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from avatar_core.contact.effects import Effect, Grasp, SelfWeight, SeveralTools
+from avatar_core.contact.effects import Effect, Grasp, LargeDeformation, SelfWeight, SeveralTools
 from avatar_core.contact.effects.grasp import FARTHEST, REACH
 from avatar_core.contact.model import ContactData, Status, model_of, step
+from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.errors import SceneError
 from avatar_core.geometry.tip import Jaw, Tip
 from avatar_core.vademecum.model import Vademecum
@@ -78,17 +81,85 @@ def test_the_stiffness_is_that_of_the_organ_and_of_a_bonded_disc() -> None:
     assert t @ less @ t == pytest.approx((2.0 - nu) / (8.0 * shear), rel=1e-6)
 
 
-def test_no_closed_path_gains_energy() -> None:
-    data, at = holding(middle())
+def gained_on_a_loop(data: ContactData, start: np.ndarray, size: float) -> float:
+    """Work that a closed path returns, over the work done along it."""
     turn = np.linspace(0.0, 2.0 * np.pi, 400)
     way = np.stack([np.sin(turn), np.sin(2.0 * turn), 1.0 - np.cos(3.0 * turn)], axis=1)
-    path, force = at[0] + 4e-3 * way, []
+    path, force = start + size * way, []
     for place in path:
         step(data.model, data, place[None])
         force.append(data.out.force[0].copy())
     mean = 0.5 * (np.array(force)[1:] + np.array(force)[:-1])
     work = -(mean * np.diff(path, axis=0)).sum(axis=1)
-    assert abs(work.sum()) < 1e-9 * np.abs(work).sum()
+    return float(work.sum() / np.abs(work).sum())
+
+
+def test_no_closed_path_gains_energy() -> None:
+    data, at = holding(middle())
+    assert abs(gained_on_a_loop(data, at[0], 4e-3)) < 1e-9
+
+
+@pytest.fixture()
+def soft(bent: Vademecum) -> Vademecum:
+    """An organ of large deformation so soft that its jaw does not slip."""
+    return bent.at(young=2e4)
+
+
+@pytest.fixture()
+def soft_hold(soft: Vademecum) -> tuple[ContactData, np.ndarray]:
+    """A jaw that has closed over the soft organ, and where it is."""
+    position = middle_of_access(soft)
+    effects = (Grasp(), LargeDeformation())
+    data = model_of(soft, (jaw_of(radius=15e-3),), effects=effects, cloud="volume").data()
+    at = soft.surface.centers[[position]] + (RADIUS + ABOVE) * soft.surface.normals[position]
+    step(data.model, data, at, None, OPEN)
+    step(data.model, data, at, None, SHUT)
+    return data, at
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0], ids=["pull", "push"])
+def test_a_long_pull_bends_the_organ_as_the_vademecum_says(
+    soft: Vademecum, soft_hold: tuple[ContactData, np.ndarray], side: float
+) -> None:
+    data, at = soft_hold
+    state, n = data.state, data.state.normal[0].copy()
+    pull = side * 12e-3 * n
+    status = [step(data.model, data, at + part * pull) for part in (0.3, 0.6, 1.0)]
+    assert status == [Status.OK] * 3
+    g = -data.out.force[0]
+    nodes, weights = state.nodes[0, : state.n_nodes[0]], state.weight[0, : state.n_nodes[0], 0]
+    m = weights @ soft.surface.normals[nodes]
+    m /= np.linalg.norm(m)
+    pressed = soft.push(nodes, weights, -float(g @ m))
+    bent_depth = pressed.depth - replace(soft, large=None).push(nodes, weights, -float(g @ m)).depth
+    assert abs(bent_depth) > 0.2e-3
+    # the law: (C + disc) g = y + n k h
+    left = np.linalg.solve(state.grasp.stiffness[0], g) - pull
+    kept = state.large_deformation.kept[0]
+    assert left @ n == pytest.approx(kept * bent_depth, rel=0.05)
+    assert np.linalg.norm(left - (left @ n) * n) < 1e-6
+    want = pressed.displacement + soft.displacement(nodes, weights) @ (g - (g @ m) * m)
+    far = np.linalg.norm(soft.mesh.vertices - state.point[0], axis=1) > 50e-3
+    shown, want = data.out.cloud[far, 3:], want.reshape(-1, 3)[far]
+    assert np.abs(shown - want).max() < 0.02 * np.abs(want).max()
+
+
+def test_no_closed_path_gains_energy_at_large_deformation(
+    soft_hold: tuple[ContactData, np.ndarray],
+) -> None:
+    data, at = soft_hold
+    assert abs(gained_on_a_loop(data, at[0], 10e-3)) < 1e-5  # the trapezoidal rule's
+
+
+def test_a_large_pull_beyond_its_reach_is_said(soft_hold: tuple[ContactData, np.ndarray]) -> None:
+    data, at = soft_hold
+    n = data.state.normal[0].copy()
+    reach = float(data.state.large_deformation.pulled[0, 2])
+    assert step(data.model, data, at + 0.7 * reach * n) == Status.OK
+    assert step(data.model, data, at + 3.0 * reach * n) == Status.EXTRAPOLATED
+    aside = np.cross(n, np.eye(3)[np.argmin(abs(n))])
+    aside *= 1.2 * FARTHEST / np.linalg.norm(aside)
+    assert step(data.model, data, at + aside) == Status.EXTRAPOLATED
 
 
 def test_two_graspers_feel_each_other_alike() -> None:

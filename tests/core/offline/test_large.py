@@ -89,7 +89,10 @@ def test_economised_terms_stand_for_the_whole_series() -> None:
 
 
 @pytest.mark.long
-def test_pushes_at_load_positions_are_right_where_linear_ones_are_not(bent: Vademecum) -> None:
+@pytest.mark.parametrize("side", [1.0, -1.0], ids=["push", "pull"])
+def test_pushes_at_load_positions_are_right_where_linear_ones_are_not(
+    bent: Vademecum, side: float
+) -> None:
     """Without interpolation there, errors come from the terms and the modes.
 
     The rule lets the terms of the deeper push, close to the reach, be wrong by its tolerance.
@@ -99,20 +102,24 @@ def test_pushes_at_load_positions_are_right_where_linear_ones_are_not(bent: Vade
     for j in np.argsort(distance)[[0, 12]]:
         triangle, corner = np.argwhere(surface.corners == j)[0]
         point = tuple(np.eye(3)[corner])
-        rows, lost = push_rows(bent, problem, triangle, np.array([7e-3, 14e-3]), point)
+        rows, lost = push_rows(bent, problem, triangle, side * np.array([7e-3, 14e-3]), point)
         assert not lost
         for row in rows:
-            assert row.contact < (0.02 if row.depth < 10e-3 else LargeRule().tolerance)
-            assert row.contact < 0.3 * row.linear_contact
+            assert row.contact < (0.02 if abs(row.depth) < 10e-3 else LargeRule().tolerance)
+            assert row.contact < (0.3 * row.linear_contact if side > 0.0 else 0.02)
             assert row.l2 < row.linear_l2
 
 
 @pytest.mark.long
 def test_certificate_speaks_of_pushes_within_the_range(bent: Vademecum) -> None:
     certificate, rows = certify_large(bent, hyperelastic_problem(bent, "neo-hookean"), 2, seed=1)
-    inside = [row for row in rows if row.within]
+    inside = [row for row in rows if row.within and row.depth > 0.0]
     assert certificate.n_pushes == len(inside)
     assert certificate.l2_worst == max(row.l2 for row in inside)
+    pulls = [row for row in rows if row.within and row.depth < 0.0]
+    assert certificate.n_pulls == len(pulls) > 1
+    assert certificate.pull_l2_worst == max(row.l2 for row in pulls)
+    assert certificate.pull_l2_mean < certificate.pull_linear_l2_mean
 
 
 def test_a_small_push_is_the_linear_one(bent: Vademecum) -> None:
@@ -137,7 +144,7 @@ def test_a_depth_that_no_force_reaches_is_refused(bent: Vademecum) -> None:
     """A depth of a - 50 a^2 / m has its maximum at 5 mm."""
     assert bent.large is not None
     depth = np.zeros_like(bent.large.depth)
-    depth[0] = -50.0
+    depth[:, 0] = -50.0
     soft = replace(bent.large, depth=depth, reach=np.ones_like(bent.large.reach))
     here = np.array([middle_of_access(bent)]), np.ones(1)
     with pytest.raises(ConvergenceError, match="12 mm deep"):
