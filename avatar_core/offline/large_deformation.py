@@ -43,7 +43,8 @@ _WORST_OVER_MEAN = 5.0  # of what the modes of a region may leave
 # x^4 and x^5 in x^2 and x^3 on [0, 1], and the largest error relative to x
 _ECONOMISED = np.array([[-0.43078, 1.39231], [-0.68586, 1.61050]])
 _LEFT = np.array([0.0385, 0.0754])
-_PULLED = (-1.0) ** np.arange(1, _ORDER + 1)  # of the terms, by powers of |a|
+# of the terms by powers of |a|, for pushes and pulls
+_SIGNS = np.stack([np.ones(_ORDER), (-1.0) ** np.arange(1, _ORDER + 1)])
 
 
 @dataclass(frozen=True)
@@ -138,8 +139,8 @@ def _follow(
         terms = path_series(problem, force, _ORDER)
         average = np.einsum("xj,xj->j", force, terms[0])
         terms = terms / (average ** np.arange(1, _ORDER + 1)[:, None])[:, None]
-        for (i, j), (side, turned) in product(enumerate(batch), enumerate((1.0, _PULLED))):
-            one = terms[:, :, i] * np.reshape(turned, (-1, 1))
+        for (i, j), (side, turned) in product(enumerate(batch), enumerate(_SIGNS)):
+            one = turned[:, None] * terms[:, :, i]
             beta = force[:, i] @ one.T
             reach[side, j], size[side, j] = _reach(problem, one, beta, mass, rule)
             fields[side, :, j] = economised(one[:, : 3 * n_vertices], reach[side, j])

@@ -27,6 +27,7 @@ from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.reduction.block_field import Blocks, blocks_of
 
 ORGAN = "organ"  # the first part
+WALLS = "walls of the cut"  # the last part of an organ that is cut
 DISPLAYED = 8000  # vertices: of 24 bytes each, two cores carry a thousand clouds a second
 # Vertices of a structure. With the fewest, two triangles of a ball meet at 3 degrees on average and
 # look smooth. On a lesion of 20 mm by marching cubes they meet at 15 degrees.
@@ -51,7 +52,7 @@ class Display:
     first_face : ndarray of int64, shape (n_parts + 1,)
         First face of each part; vertices likewise follow each other.
     names : tuple[str, ...]
-        Names of the parts; the first is the organ's surface.
+        Names of the parts; the first is the organ's surface, the last may be ``WALLS``.
     """
 
     vertices: np.ndarray
@@ -90,10 +91,16 @@ def organ_display(
 def display_of(
     mesh: TetMesh, organ: Triangles, structures: Sequence[tuple[str, Triangles]] = ()
 ) -> Display:
-    """Return the organ's surface and named structures inside, tied to a mesh."""
+    """Return the organ's surface, structures inside and the walls of a cut, tied to a mesh."""
     inside = [triangles for _, triangles in structures]
     tied = [_on_boundary(mesh, organ[0]), *(carriers(mesh, points) for points, _ in inside)]
-    parts = [organ, *inside]
+    names, parts = [ORGAN, *(name for name, _ in structures)], [organ, *inside]
+    if mesh.pairs is not None:
+        parts[0], tied[0] = _split(mesh, organ, tied[0])
+        used, number = np.unique(np.concatenate(mesh.cut_faces), return_inverse=True)
+        names.append(WALLS)
+        parts.append((mesh.vertices[used], number.reshape(-1, 3)))
+        tied.append((np.tile(used[:, None], 4), np.tile([1.0, 0.0, 0.0, 0.0], (len(used), 1))))
     before = np.cumsum([0, *(len(points) for points, _ in parts)])
     faces = [triangles + n for (_, triangles), n in zip(parts, before[:-1], strict=True)]
     weights = np.maximum(np.concatenate([part for _, part in tied]), 0.0)
@@ -103,7 +110,7 @@ def display_of(
         np.concatenate([part for part, _ in tied]).astype(np.int32),
         (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32),
         np.cumsum([0, *(len(part) for part in faces)]),
-        (ORGAN, *(name for name, _ in structures)),
+        tuple(names),
     )
 
 
@@ -112,6 +119,29 @@ def _on_boundary(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     faces = mesh.boundary_faces
     _, face, weights = closest_points(mesh.vertices, faces, np.asarray(points, float))
     return faces[face][:, [0, 1, 2, 0]], np.pad(weights, ((0, 0), (0, 1)))
+
+
+def _split(
+    mesh: TetMesh, organ: Triangles, tied: tuple[np.ndarray, np.ndarray]
+) -> tuple[Triangles, tuple[np.ndarray, np.ndarray]]:
+    """Part a surface that a cut crosses: each triangle hangs on the tissue of one side alone.
+
+    Triangles with vertices on both sides go to the first; their vertices on the second are doubled.
+    """
+    (points, faces), (corners, weights) = organ, tied
+    second = np.zeros(len(mesh.vertices), bool)
+    second[mesh.tets[mesh.is_second_side]] = True
+    is_second = second[corners[:, 0]]
+    across = is_second[faces].any(axis=1) & ~is_second[faces].all(axis=1)
+    moved = is_second[faces] & across[:, None]
+    doubled, number = np.unique(faces[moved], return_inverse=True)
+    faces = faces.copy()
+    faces[moved] = len(points) + number
+    first = mesh.boundary_faces[~second[mesh.boundary_faces[:, 0]]]
+    _, face, on_face = closest_points(mesh.vertices, first, points[doubled])
+    corners = np.concatenate([corners, first[face][:, [0, 1, 2, 0]]])
+    weights = np.concatenate([weights, np.pad(on_face, ((0, 0), (0, 1)))])
+    return (np.concatenate([points, points[doubled]]), faces), (corners, weights)
 
 
 def blocks_to_display(mesh: TetMesh, display: Display | None) -> Blocks:

@@ -30,7 +30,7 @@ from avatar_core.reduction.pgd import EnrichmentReport
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.at_values import Valued, at_values, ranges
 from avatar_core.vademecum.certificate import Certificate
-from avatar_core.vademecum.display import Display
+from avatar_core.vademecum.display import ORGAN, WALLS, Display
 from avatar_core.vademecum.large_deformation import LargeCertificate, LargeDeformation, Push
 from avatar_core.vademecum.modal_mass import BodyResponse
 from avatar_core.vademecum.parametric import ParametricResponse
@@ -400,7 +400,16 @@ class Vademecum:
         display = self.display
         if display is None:
             return {}
-        return {name: display.faces_of(k) for k, name in enumerate(display.names) if k > 0}
+        names = [name for name in display.names if name not in (ORGAN, WALLS)]
+        return {name: display.faces_of(1 + k) for k, name in enumerate(names)}
+
+    @property
+    def cut_walls(self) -> np.ndarray:
+        """Triangles of both walls of a cut, over :attr:`surface_vertices`, shape (m, 3)."""
+        display = self.display
+        if display is None or display.names[-1] != WALLS:
+            return np.zeros((0, 3), np.int32)
+        return display.faces_of(len(display.names) - 1)
 
     @property
     def clamped_faces(self) -> np.ndarray:

@@ -14,18 +14,26 @@ def part_volumes(v: Vademecum) -> tuple[float, float]:
     return float(v.mesh.tet_volumes[~second].sum()), float(v.mesh.tet_volumes[second].sum())
 
 
-def margins(v: Vademecum) -> dict[str, float]:
-    """Least distance of each structure inside to the resection at rest [m]; 0 if it is cut."""
-    if v.resection is None or v.display is None:
+def margins(v: Vademecum, points: np.ndarray | None = None) -> dict[str, float]:
+    """Return the least distance of each structure inside to the walls of the cut [m].
+
+    It is 0 for a structure that is cut.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3), optional
+        Displayed vertices, moved [m]; those at rest by default.
+    """
+    if v.display is None or not len(v.cut_walls):
         return {}
+    points = np.asarray(v.display.vertices if points is None else points, float)
     second = np.zeros(len(v.mesh.vertices), bool)
     second[v.mesh.tets[v.mesh.is_second_side]] = True
     out = {}
     for name, faces in v.structures.items():
         used = np.unique(faces)
-        points = v.display.vertices[used].astype(float)
-        nearest, _, _ = closest_points(v.mesh.vertices, v.mesh.cut_faces[0], points)
+        nearest, _, _ = closest_points(points, v.cut_walls, points[used])
         side = second[v.display.corners[used, 0]]
         is_cut = bool(side.any() and not side.all())
-        out[name] = 0.0 if is_cut else float(np.linalg.norm(points - nearest, axis=1).min())
+        out[name] = 0.0 if is_cut else float(np.linalg.norm(points[used] - nearest, axis=1).min())
     return out

@@ -391,7 +391,7 @@ class PlanningNode(ManagedNode):
         self._chosen.contact, self._is_to_restore = values, True
         self._use_tools(self._chosen.moved)
         self._view.change_tips(self._chosen.tips)
-        self._panels.organ.show_material(self._chosen.in_force)
+        self._chosen.show_material()
 
     def _use_tools(self, names: tuple[str, ...]) -> None:
         """Move these tools of the contact node; if their number changes, from starting places."""

@@ -159,6 +159,14 @@ def test_show_says_the_parts_and_the_margin_of_the_tumour(
     assert sum(volumes) == pytest.approx(organ.mesh.volume)
     # a ball of 20 mm around a point 30 mm off the plane
     assert margins(organ) == {"tumour": pytest.approx(10e-3, abs=1.5e-3)}
+    moved = organ.surface_vertices.copy()
+    (tumour,) = (np.unique(faces) for faces in organ.structures.values())
+    a, b, c = moved[organ.cut_walls[0]]
+    across = np.cross(b - a, c - a) / np.linalg.norm(np.cross(b - a, c - a))
+    moved[tumour] -= 3e-3 * np.sign((moved[tumour[0]] - a) @ across) * across
+    assert margins(organ)["tumour"] - margins(organ, moved)["tumour"] == pytest.approx(
+        3e-3, rel=0.1
+    )
     save_vademecum(organ, tmp_path / "cut.h5")
     show(tmp_path / "cut.h5", as_json=False)
     text = capsys.readouterr().out
@@ -169,6 +177,23 @@ def test_show_says_the_parts_and_the_margin_of_the_tumour(
     said = json.loads(capsys.readouterr().out)["resection"]
     assert said["volumes"] == [pytest.approx(v) for v in volumes]
     assert said["opened"] == 0.0
+
+
+def test_a_cut_that_opens_stretches_no_triangle_over_the_gap(organ: Vademecum) -> None:
+    """Each displayed triangle hangs on one side, and both walls show where it gapes."""
+    display, mesh = organ.display, organ.mesh
+    assert display is not None
+    second = np.zeros(len(mesh.vertices), bool)
+    second[mesh.tets[mesh.is_second_side]] = True
+    carrying = display.weights > 1e-6
+    for face in (*organ.organ_faces, *organ.cut_walls):
+        sides = second[display.corners[face]][carrying[face]]
+        assert sides.all() or not sides.any()
+    first, other = mesh.cut_faces
+    assert len(organ.cut_walls) == len(first) + len(other)
+    at = np.einsum("nk,nkd->nd", display.weights, mesh.vertices[display.corners])
+    walls = np.unique(organ.cut_walls)
+    np.testing.assert_allclose(at[walls], display.vertices[walls], atol=1e-7)
 
 
 def test_a_tumour_on_both_sides_is_said_to_be_cut(organ: Vademecum) -> None:

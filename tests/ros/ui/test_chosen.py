@@ -118,7 +118,18 @@ def test_what_another_client_sets_is_shown_once(chosen: Chosen, cell: Noted) -> 
     """For example `avatar calibrate --set`; a user may be typing another value."""
     for _ in range(3):
         chosen.follow_contact({"material.young_modulus": 8e3, "uncertainty": ""})
-    assert chosen.given == {"young": 8e3} and cell.of("show_material") == [{"young": 8e3}]
+    assert chosen.given == {"young": 8e3}
+    assert cell.of("show_material") == [{"young": 8e3, "poisson": 0.48}]
+
+
+def test_a_value_of_the_scene_is_shown(chosen: Chosen, cell: Noted, tmp_path: Path) -> None:
+    """Of the scene that the contact node was started with, and as built again without it."""
+    scene = tmp_path / "soft.yaml"
+    scene.write_text("material: {poisson_ratio: 0.42}\n")
+    chosen.note_contact({"scene": str(scene)})
+    assert cell.of("show_material")[-1]["poisson"] == 0.42
+    chosen.choose_scene("palpation")
+    assert cell.of("show_material")[-1]["poisson"] == 0.48
 
 
 def test_of_a_slider_the_last_look_is_drawn(chosen: Chosen, cell: Noted) -> None:

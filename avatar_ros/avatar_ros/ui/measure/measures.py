@@ -11,6 +11,7 @@ import numpy as np
 
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip
+from avatar_core.vademecum.resected import margins
 from avatar_ros.ui.measure.measures_view import MeasuresView
 from avatar_ros.ui.view.measuring import Place, depth, gap, hit, is_plane, margin
 from avatar_ros.ui.view.organ import Organ
@@ -113,7 +114,7 @@ class Measures:
         organ = self._organ
         if organ is None or len(now.points) != len(organ.vertices):
             return []
-        lines = [*self._around_tool(organ, now), *self._at_places(organ, now)]
+        lines = [*self._around_tool(organ, now), *_at_cut(organ, now), *self._at_places(organ, now)]
         self._draw(now.points)
         return lines
 
@@ -165,6 +166,15 @@ class Measures:
             if mode == PLANE:
                 size = 0.0 if self._organ is None else 0.6 * self._organ.size
                 self._view.plane(whole, size)
+
+
+def _at_cut(organ: Organ, now: Now) -> list[str]:
+    """Return a line for each structure on its distance from the organ's cut."""
+    rest = margins(organ.vademecum)
+    return [
+        f"Cut to {name}: {1e3 * rest[name]:.1f} mm at rest, {1e3 * found:.1f} mm now"
+        for name, found in (margins(organ.vademecum, now.points) if rest else {}).items()
+    ]
 
 
 def _compliance(organ: Organ, place: Place) -> float | None:

@@ -188,7 +188,11 @@ class Chosen:
     def note_contact(self, values: dict[str, Any]) -> None:
         """Note parameters of the contact node, whoever set them."""
         self.contact |= values
-        self._page.show_material(self.in_force)
+        self.show_material()
+
+    def show_material(self) -> None:
+        """Show the values in force, those of the scene among them."""
+        self._page.show_material(self.values(self.organ) if self.organ else self.given)
 
     def follow_contact(self, values: dict[str, Any]) -> None:
         """Note parameters of the contact node if any has changed."""
@@ -214,6 +218,7 @@ class Chosen:
             if switched:
                 self.scene = name
                 self._page.change_tips(self.tips)
+                self.show_material()
 
         shown = name or "the scene of the contact node's start"
         self._requests.load_scene(shown, self._page.say, yaml=text, then=note)

@@ -28,7 +28,7 @@ class Organ:
     """An organ at rest.
 
     vertices : ndarray, shape (n, 3) float32, points of the cloud [m]; faces : (m, 3), of the organ
-    structures : faces of the structures inside, by name
+    structures : faces of the structures inside, by name; walls : of a cut's walls
     clamped, sprung, accessible : ndarray of bool, shape (m,)
     centre : centre of the bounding box [m]; size : its longest side [m]
     start, normal : a point in the middle of the accessible surface [m], and the normal there
@@ -42,6 +42,7 @@ class Organ:
     vertices: np.ndarray
     faces: np.ndarray
     structures: dict[str, np.ndarray]
+    walls: np.ndarray
     clamped: np.ndarray
     sprung: np.ndarray
     accessible: np.ndarray
@@ -74,6 +75,7 @@ class Organ:
             vertices=vertices,
             faces=v.organ_faces,
             structures=v.structures,
+            walls=v.cut_walls,
             clamped=v.clamped_faces,
             sprung=v.supported_faces,
             accessible=v.accessible_faces,

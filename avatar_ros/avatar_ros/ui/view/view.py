@@ -9,6 +9,7 @@ import numpy as np
 import viser
 
 from avatar_core.geometry.tip import Tip
+from avatar_core.vademecum.display import WALLS
 from avatar_ros.ui.view import tone
 from avatar_ros.ui.view.camera import Cameras
 from avatar_ros.ui.view.colours import top_for
@@ -16,7 +17,7 @@ from avatar_ros.ui.view.cut_handle import CutHandle
 from avatar_ros.ui.view.measuring import Place, hit
 from avatar_ros.ui.view.organ import Organ
 from avatar_ros.ui.view.orientation import AXES
-from avatar_ros.ui.view.structures_view import StructuresView
+from avatar_ros.ui.view.structures_view import FLESH, StructuresView
 from avatar_ros.ui.view.surface_view import Marks, SurfaceView
 from avatar_ros.ui.view.tip_body import turn_to
 from avatar_ros.ui.view.tool_view import ToolView
@@ -76,7 +77,9 @@ class OrganView:
             self._roots[name] = scene.add_frame(name, show_axes=False)
         self._skin = scene.add_frame(_SURFACE, show_axes=False)
         self._organ, self.top, self._drawn, self._field = organ, top_for(0.0), None, None
-        self._structures.show(organ.vertices, organ.structures)
+        walls = {WALLS: organ.walls} if len(organ.walls) else {}
+        self._structures.show(organ.vertices, organ.structures | walls)
+        self._structures.style(WALLS, True, FLESH, 1.0)
         marks = Marks(organ.clamped, organ.sprung, organ.accessible)
         self._surface.show(organ.vertices, organ.faces, marks)
         self.look(GLASS if organ.structures else WHOLE)
