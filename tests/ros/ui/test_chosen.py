@@ -123,7 +123,7 @@ def test_what_another_client_sets_is_shown_once(chosen: Chosen, cell: Noted) -> 
 
 
 def test_a_value_of_the_scene_is_shown(chosen: Chosen, cell: Noted, tmp_path: Path) -> None:
-    """Of the scene that the contact node was started with, and as built again without it."""
+    """The contact node was started with the scene; without it the value is as built again."""
     scene = tmp_path / "soft.yaml"
     scene.write_text("material: {poisson_ratio: 0.42}\n")
     chosen.note_contact({"scene": str(scene)})

@@ -12,7 +12,7 @@ from avatar_ros.ui.view.colours import lightness, shaded
 from avatar_ros.ui.view.surface_view import own
 
 STRUCTURE = (213, 94, 0)  # vermilion of Okabe and Ito, distinguishable for all
-FLESH = (150, 40, 45)  # of a cut's walls
+FLESH = (150, 40, 45)  # colour of a cut's walls
 _N_SHADES = 8
 
 
