@@ -10,8 +10,8 @@
     data = model.data()                             # of one loop
     status = av.step(model, data, tips)             # 1 kHz; never fails: see data.out
 
-All lengths are in metres, forces in newtons. An error that a user can cause and cure raises
-:class:`AvatarError` with one line that names cause and remedy.
+All lengths are in metres, forces in newtons. An error that a user can cure raises
+:class:`AvatarError`, with one line that names cause and remedy.
 
 ``msg_docs/background/architecture.md`` has the rooms, in the order in which data flows and imports
 may run.

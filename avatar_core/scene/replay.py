@@ -104,7 +104,13 @@ def replay(
 
 
 def scene_of(recording: Recording) -> Scene:
-    """Return the scene in a recording, without checks: its errors are recorded facts."""
+    """Return the scene in a recording.
+
+    Raises
+    ------
+    StorageError
+        If this version of avatar does not accept the scene.
+    """
     try:
         return parse_scene(recording.scene, "scene of the recording")
     except SceneError as error:

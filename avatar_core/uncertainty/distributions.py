@@ -127,8 +127,8 @@ class Lognormal:
             )
 
     def ppf(self, probability: FloatArray) -> FloatArray:
-        # Here, because the contact node needs none of it.
         """Return the quantiles at some probabilities (0 to 1)."""
+        # Here, because the contact node needs none of it.
         from scipy.special import ndtri
 
         return np.asarray(self.median * self.factor ** ndtri(probability))

@@ -69,7 +69,7 @@ class Friction(Effect):
             )
 
     def lay_out(self, ground: Ground) -> Any:
-        """Return coefficients and tangential compliance of the tips."""
+        """Return the static and the kinetic coefficient."""
         return self.Constants(np.array([self.static, self.kinetic]))
 
 

@@ -58,7 +58,7 @@ class Respiration(Effect):
         return cls(amplitude=1e-3)
 
     def lay_out(self, ground: Ground) -> Any:
-        """Return period, shape and stroke of the breath."""
+        """Return stroke and timing of the breath."""
         return self.Constants(
             self.amplitude * np.array(self.axis),
             np.array([self.period, float(self.dwell), ground.period]),

@@ -77,8 +77,8 @@ class Tilt(Effect):
             raise SceneError("tilt: no tool has a flat tip; give one, or leave tilt out")
 
     def lay_out(self, ground: Ground) -> Any:
+        """Return the tools' axis, radii of flat punches and the surface's normals."""
         # Here, because the contact node needs none of it.
-        """Return the radii of flat punches and the surface's normals."""
         from avatar_core.vademecum.tip_field import grid_normals
 
         self.require_flat(ground.tips)

@@ -96,7 +96,7 @@ class Viscoelasticity(Effect):
         return cls((0.3, 0.25), (0.5, 8.0))
 
     def lay_out(self, ground: Ground) -> Any:
-        """Return the coefficients of a period."""
+        """Return decay, ramp, rest and gain of a period."""
         g, tau, period = np.array(self.g, float), np.array(self.tau, float), ground.period
         ramp, rest = g * (tau / period) * -np.expm1(-period / tau), np.array([1.0 - g.sum()])
         return self.Constants(np.exp(-period / tau), ramp, rest, 1.0 / (rest + ramp.sum()))
