@@ -11,7 +11,7 @@ from typing import Any
 def lazy(
     package: str, origin: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """``__getattr__`` and ``__dir__`` of a package (PEP 562).
+    """Return ``__getattr__`` and ``__dir__`` of a package (PEP 562).
 
     Parameters
     ----------

@@ -386,7 +386,7 @@ class LLE:
 
 
 def _checked_gram(rows: tuple[FloatArray, ...], gram: Gram | None) -> Gram:
-    """The inner products of shapes, as given or computed; raises LLEError for bad shapes."""
+    """Return the inner products of shapes, given or computed; raise LLEError for bad shapes."""
     if any(row.shape != rows[0].shape or row.ndim != 1 for row in rows):
         raise LLEError("lle: the vectors differ in length; compute all on one grid")
     gram = Gram.of(rows) if gram is None else gram
@@ -402,7 +402,7 @@ def _checked_gram(rows: tuple[FloatArray, ...], gram: Gram | None) -> Gram:
 
 
 def _equals(gram: Gram) -> IntArray:
-    """Number of the first member equal to each, shape (n,)."""
+    """Return the number of the first member equal to each, shape (n,)."""
     same_as = np.zeros(1, dtype=np.int64)
     for i in range(1, len(gram.products)):
         same_as = np.append(same_as, _first_equal(gram, i, same_as))
@@ -423,7 +423,7 @@ def _first_equal(gram: Gram, i: int, same_as: IntArray) -> int:
 
 
 def _weights(base: LLE) -> tuple[IntArray, FloatArray]:
-    """Neighbours and weights of every member, both of shape (n, k)."""
+    """Return neighbours and weights of every member, both of shape (n, k)."""
     n = len(base.vectors_)
     is_first = base.same_as_ == np.arange(n)
     first, again = np.flatnonzero(is_first), np.flatnonzero(~is_first)
@@ -460,9 +460,10 @@ def _row_weights(base: LLE, rows: IntArray, neighbors: IntArray) -> FloatArray:
 
 
 def _imprecise(local: FloatArray, lengths: FloatArray, base: LLE) -> IntArray:
-    """Neighbourhoods where rounding of the Gram matrix may change the weights by more than TRUSTED.
+    """Return neighbourhoods whose weights rounding may change by more than TRUSTED.
 
-    Estimated as the rounding eps |X|^2 over the smallest eigenvalue, which is at least r tr(C).
+    The estimate is the rounding eps |X|^2 of the Gram matrix over the smallest eigenvalue, which is
+    at least r tr(C).
     """
     ridge = base.regularization * np.trace(local, axis1=1, axis2=2)
     rounding = ROUNDING * lengths
