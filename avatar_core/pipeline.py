@@ -293,7 +293,6 @@ def organ_problem(surface: SurfaceMesh, options: OrganOptions | None = None) -> 
 
     Parameters
     ----------
-    surface : SurfaceMesh
     options : OrganOptions, optional
         Mesh, material, element, supports and patch radius count here.
 

@@ -20,16 +20,10 @@ class AtlasError(AvatarError):
 class ResponseKind:
     """Method by which a response was computed.
 
-    Attributes
-    ----------
-    material : Material
-        Material of the finite element solutions.
-    element : Element
-        Element of the finite element solutions.
-    patch_radius : float
-        Radius of the load patches [m].
-    rank : int
-        Number of modes.
+    material : material of the finite element solutions
+    element : element of the finite element solutions
+    patch_radius : radius of the load patches [m]
+    rank : number of modes
     """
 
     material: Material
@@ -91,14 +85,12 @@ class Anatomy:
         Name, unique in the atlas.
     key : str
         Hash of the surface and its reading.
-    origin : Origin
     volume : float
         Volume [m3].
     alignment : SimilarityTransform
         Similarity from the template to the organ.
     registered : ndarray, shape (n_template_vertices, 3)
         The template registered to the organ [m].
-    quality : RegistrationQuality
     converged : bool
         Whether the registration converged.
     response : ResponseKind or None
@@ -122,7 +114,6 @@ class WholeAnatomy:
 
     Attributes
     ----------
-    shape : Anatomy
     distances : ndarray, shape (n_points,)
         Signed distance at the points of the atlas's box [m].
     response : Response or None
@@ -138,10 +129,7 @@ class WholeAnatomy:
 class Duplicate:
     """A member that has the shape of an earlier one; it has no weight in any barycenter.
 
-    Attributes
-    ----------
-    name, of : str
-        Names of the member and of the earlier one.
+    name, of : names of the member and of the earlier one
     """
 
     name: str

@@ -46,7 +46,6 @@ class Frame:
 
         Parameters
         ----------
-        surface : SurfaceMesh
         alignment : SimilarityTransform
             Alignment of its registration, from the template to the organ.
         """

@@ -29,14 +29,9 @@ MOST_NEIGHBORS = 64
 class Lazy(Sequence[Item], Generic[Item]):
     """A sequence whose items are made on access; the last used ones are kept.
 
-    Parameters
-    ----------
-    make : Callable[[int], Item]
-        Function that returns the item of a number.
-    n : int
-        Length.
-    kept : int
-        Number of items that are kept.
+    make : function that returns the item of a number
+    n : length
+    kept : number of items that are kept
     """
 
     def __init__(self, make: Callable[[int], Item], n: int, kept: int = 0) -> None:
@@ -62,7 +57,6 @@ class Atlas:
 
     Attributes
     ----------
-    frame : Frame
     anatomies : tuple[Anatomy, ...]
         Anatomies in the order of their names.
     read_distances : Callable

@@ -161,14 +161,6 @@ def patient_vademecum(
 ) -> Patient:
     """Build the vademecum of a new patient: register, mesh, solve and certify.
 
-    Parameters
-    ----------
-    surface : SurfaceMesh of the patient [m, RAS]
-    atlas : Atlas with responses, or the result of :func:`avatar_core.atlas.base.base_of`
-    fidelity : "interpolated", "reduced" or "solved"
-    options : PatientOptions
-    progress : called with stage, completed fraction of it, and current error (NaN: unknown)
-
     Raises
     ------
     PatientError

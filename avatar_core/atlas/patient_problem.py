@@ -68,10 +68,6 @@ def patient_problem(
 
     Parameters
     ----------
-    surface : SurfaceMesh
-    base : PatientBase
-    registration : Registration
-    mesh : TetMesh
     groups : Mapping[str, ndarray] or None
         Points of the clamp, the accessible region and supports, in place of the template's
         (:mod:`avatar_core.geometry.groups`). Without supports, both regions are needed.

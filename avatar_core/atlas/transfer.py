@@ -58,9 +58,6 @@ def patient_weights(
 
     Parameters
     ----------
-    base : PatientBase
-    registration : Registration
-    surface : SurfaceMesh
     weighting : Weighting
         "kriging" (:func:`kriging`) and "lle-template" (Eq. 15) use the centred registered vertices.
         "lle-grid" is Eq. 15 on the distances at the common grid. "lle-paper" is the paper's form of
@@ -110,8 +107,6 @@ def combine(
 
     Parameters
     ----------
-    responses : Sequence[CompactResponse]
-    weights : Barycenter
     rank : int
         Largest number of modes.
     """
@@ -184,8 +179,6 @@ def carried(
 
     Parameters
     ----------
-    response : CompactResponse
-    registration : Registration
     loads : LoadSurface
         Load positions of the template.
     elasticity : Elasticity

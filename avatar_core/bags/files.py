@@ -37,12 +37,8 @@ def is_bag(path: Path) -> bool:
 class OpenBag:
     """A bag that is being read; a context manager, which closes it.
 
-    Attributes
-    ----------
-    connections : list
-        The library's connections, one for each topic, type and file.
-    notes : list[str]
-        Unreadable parts, one line each.
+    connections : the library's connections, one for each topic, type and file
+    notes : unreadable parts, one line each
 
     Raises
     ------

@@ -44,18 +44,11 @@ _UNIT = 1e-3  # by which a quaternion may differ from length 1, as in the loop
 class BagPath:
     """A recording that was found in a bag.
 
-    Attributes
-    ----------
-    recording : Recording
-        Its forces are zero if ``answers`` is "poses".
-    answers : str
-        Messages that the periods come from: "states", "wrenches" or "poses".
-    received : ndarray of int, shape (n,)
-        Time of receipt of each answer [ns].
-    sound : ndarray of bool, shape (n,)
-        Whether the pose was valid, as far as the bag shows.
-    notes : tuple[str, ...]
-        Messages that were left out, one line each.
+    recording : its forces are zero if ``answers`` is "poses"
+    answers : messages that the periods come from: "states", "wrenches" or "poses"
+    received : ndarray of int, shape (n,), time of receipt of each answer [ns]
+    sound : ndarray of bool, shape (n,), whether the pose was valid, as far as the bag shows
+    notes : messages that were left out, one line each
     """
 
     recording: Recording
@@ -76,7 +69,6 @@ def path_of(
 
     Parameters
     ----------
-    bag : Bag
     scene : str
         YAML of the scene of one tool.
     vademecum_id : str

@@ -23,18 +23,11 @@ MAX_MESSAGES = 10_000_000  # of a topic: nearly three hours at 1 kHz, 700 MB
 class Table:
     """Messages in the order of their receipt.
 
-    Attributes
-    ----------
-    received : ndarray of int, shape (n,)
-        Time of receipt [ns].
-    stamp : ndarray of int, shape (n,)
-        Stamp of the header [ns].
-    label : ndarray of int, shape (n,)
-        Index into ``labels``.
-    labels : tuple[str, ...]
-        Texts, e.g. frames.
-    values : ndarray, shape (n, m)
-        Numbers of each message.
+    received : ndarray of int, shape (n,), time of receipt [ns]
+    stamp : ndarray of int, shape (n,), stamp of the header [ns]
+    label : ndarray of int, shape (n,), index into ``labels``
+    labels : texts, e.g. frames.
+    values : ndarray, shape (n, m), numbers of each message
     """
 
     received: np.ndarray
@@ -56,10 +49,7 @@ class Table:
 class TableWriter:
     """Collector of rows of ``width`` numbers.
 
-    Attributes
-    ----------
-    refused : int
-        Number of messages that could not be decoded.
+    refused : number of messages that could not be decoded
     """
 
     def __init__(self, width: int) -> None:

@@ -42,7 +42,6 @@ class TouchFile:
 
     Attributes
     ----------
-    path : Path
     tool : str or None
         Name of the tool, as in NAME/measured_cp, for a bag with several tools. For a recording,
         number of the tool, from 1. None: the only tool.
@@ -61,10 +60,7 @@ class TouchFile:
 class Touched(NamedTuple):
     """Tip of a tool, times (n,) [s], positions (n, 3) [m] and forces from a file.
 
-    Attributes
-    ----------
-    vector : ndarray, shape (n, 3)
-        Forces in the sensor's axes [N].
+    vector : ndarray, shape (n, 3), forces in the sensor's axes [N]
     """
 
     tip: Tip

@@ -80,8 +80,6 @@ def step_errors(
 
     Parameters
     ----------
-    vademecum : Vademecum
-    elasticity : Elasticity
     n, seed : int
         Number of contacts, and the seed that draws them.
     single : bool
@@ -148,15 +146,9 @@ def curve_of(
 ) -> AccuracyCurve:
     """Return the curve of measured errors, not yet timed.
 
-    Parameters
-    ----------
-    vademecum : Vademecum
-    shown : ndarray, shape (n_details - 1, n)
-        Relative errors of the displacement.
-    force : ndarray, shape (n,)
-        Relative errors of the normal force.
-    sizes : Sequence[int]
-        Size of each detail [bytes].
+    shown : ndarray, shape (n_details - 1, n), relative errors of the displacement
+    force : ndarray, shape (n,), relative errors of the normal force
+    sizes : size of each detail [bytes]
     """
     details = details_of(vademecum.n_modes)
     force_error = upper_quantile(force)

@@ -36,19 +36,11 @@ _MAX_ITERATIONS = 30  # of Newton's method
 class CombinedRow:
     """One push: the error of its forces at equal depth.
 
-    Attributes
-    ----------
-    combination : str
-    site : int
-        Accessible face whose centroid is pushed.
-    depth : float
-        Depth [m].
-    contact : float
-        |F - F_FE| / |F_FE|.
-    linear_contact : float
-        The same error of the linear vademecum.
-    within : bool
-        Whether the push lies in the stored range.
+    site : accessible face whose centroid is pushed
+    depth : depth [m]
+    contact : |F - F_FE| / |F_FE|
+    linear_contact : the same error of the linear vademecum
+    within : whether the push lies in the stored range
     """
 
     combination: str
@@ -72,8 +64,6 @@ def push_errors(
 
     Parameters
     ----------
-    vademecum : Vademecum
-    problem : Hyperelasticity
     depths : Sequence[float]
         Increasing depths [m].
     n_sites, seed : int

@@ -201,12 +201,10 @@ def draw_sites(vademecum: Vademecum, surface: SurfaceMesh, n: int, seed: int) ->
 
     Parameters
     ----------
-    vademecum : Vademecum
     surface : SurfaceMesh
         Surface that the vademecum was built from.
     n : int
         Number of places, at least 3.
-    seed : int
     """
     sites = _open_sites(vademecum, surface, max(DRAWN, 2 * n), seed)
     rest = sites[n - 2 :]
@@ -295,16 +293,9 @@ def compared(
 
     A tip whose sides touch a hollow before it reaches the place is left out there.
 
-    Parameters
-    ----------
-    vademecum : Vademecum
-        Linear, at its own material.
-    surface : SurfaceMesh
-    site : Site
-    models : Sequence[_Models]
-        Steps of each tip.
-    depths : Sequence[float]
-        Depths of the lowest points below the surface [m].
+    vademecum : linear, at its own material
+    models : steps of each tip
+    depths : depths of the lowest points below the surface [m]
 
     Raises
     ------

@@ -40,7 +40,6 @@ def certify(
 
     Parameters
     ----------
-    vademecum : Vademecum
     elasticity : Elasticity
         The problem it was built from.
     n_loads : int

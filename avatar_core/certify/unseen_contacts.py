@@ -52,8 +52,6 @@ class UnseenContacts:
 
         Parameters
         ----------
-        surface : LoadSurface
-        elasticity : Elasticity
         single : bool
             Solve in single precision.
 

@@ -28,19 +28,12 @@ def require_output(
 ) -> None:
     """Raise StorageError unless a result can be written without the loss of anything else.
 
-    Parameters
-    ----------
-    output : Path
-        File to write.
-    suffixes : Iterable[str]
-        Allowed ends of its name.
-    inputs : Iterable[str or Path or None]
-        Files that are read. They are never replaced, whatever name or link leads to them.
-    replaces : Callable[[Path], bool] or None
-        Function that returns whether an existing file may be replaced; None: any file of that
-        suffix.
-    overwrite : bool
-        Replace any file but an input.
+    output : file to write
+    suffixes : allowed ends of its name
+    inputs : files that are read. They are never replaced, whatever name or link leads to them.
+    replaces : function that returns whether an existing file may be replaced; None: any file of
+        that suffix
+    overwrite : replace any file but an input
     """
     suffixes = tuple(suffixes)
     if output.suffix not in suffixes:

@@ -56,14 +56,8 @@ def palpation_picture(
     Left: deformed boundary seen from the front, coloured by displacement. Right: normal force over
     depth by the 1 kHz step, on a half-space (Hertz 1882), and by resolved contact.
 
-    Parameters
-    ----------
-    vademecum : Vademecum
-    surface : SurfaceMesh
-        Surface that the vademecum was built from.
-    path : str or Path
-    progress : Callable[[float], None] or None
-        Called with the finished fraction of the resolved contact.
+    surface : surface that the vademecum was built from
+    progress : called with the finished fraction of the resolved contact
     """
     import matplotlib
 

@@ -63,7 +63,6 @@ def allocate(of: Any, sizes: Mapping[str, int], **given: Any) -> Any:
 
     Parameters
     ----------
-    of : kind
     sizes : Mapping[str, int]
         Sizes of the dimensions that have names.
     given : ndarray or tuple
@@ -139,7 +138,6 @@ class ArrayTable:
 
     Attributes
     ----------
-    numba_type : TableType
     address : int
         Address of the table, for compiled code.
 

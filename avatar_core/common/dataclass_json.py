@@ -54,7 +54,6 @@ def of_plain(kind: type[Kind], value: Any, key: str) -> Kind:
 
     Parameters
     ----------
-    kind : type
     value : Any
         Value as JSON gives it.
     key : str

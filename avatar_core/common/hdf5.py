@@ -39,9 +39,6 @@ def replace_file(
 
     Parameters
     ----------
-    path : Path
-    arrays : dict[str, ndarray]
-    attributes : dict[str, str]
     packed : bool
         Compress large arrays, without loss. Not for almost constant arrays: claims above
         ``MAX_EXPANSION`` times the file's size are refused.

@@ -21,12 +21,9 @@ if TYPE_CHECKING:
 class CloudArrays(NamedTuple):
     """The arrays of the same names in :class:`avatar_core.contact.layout.MODEL`, and their source.
 
-    Attributes
-    ----------
-    vertex : ndarray
-        Vertex of the mesh, in each place of the blocks; -1 where a block is not full.
-    large_start : ndarray
-        Like ``region_start``, for the modes of large deformation, which come last.
+    vertex : ndarray, vertex of the mesh, in each place of the blocks; -1 where a block is not full
+    large_start : ndarray, like ``region_start``, for the modes of large deformation, which come
+        last
     """
 
     space: np.ndarray

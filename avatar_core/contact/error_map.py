@@ -24,7 +24,6 @@ def force_error_at(vademecum: Vademecum, points: np.ndarray) -> np.ndarray:
 
     Parameters
     ----------
-    vademecum : Vademecum
     points : ndarray, shape (n, 3)
         Points of the surface at rest [m].
     """

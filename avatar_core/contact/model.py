@@ -163,7 +163,6 @@ def model_of(
 
     Parameters
     ----------
-    vademecum : Vademecum
     tips : Sequence[Tip]
         Tip of each tool.
     modes : int or None
@@ -199,8 +198,6 @@ def step(
 
     Parameters
     ----------
-    model : ContactModel
-    data : ContactData of the model, whose ``out`` is filled
     tips : ndarray, shape (n_tools, 3), sphere centres [m]
     orientations : ndarray, shape (n_tools, 4), unit quaternions x y z w of the tools' frames in the
         organ's, zero for one that is not known; None if no tool turns. For friction and tilt.

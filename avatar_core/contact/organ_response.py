@@ -58,12 +58,7 @@ TipResponse = namedtuple(
 def tip_carriers(surface: LoadSurface, field: TipField, depth: float, height: float) -> TipCarriers:
     """Return load positions and weights at the grid points that a tip may need.
 
-    Parameters
-    ----------
-    surface : LoadSurface
-    field : TipField
-    depth, height : float
-        Farthest tip centre below and above the surface [m].
+    depth, height : farthest tip centre below and above the surface [m]
     """
     # Here, because the contact node needs none of it.
     from avatar_core.vademecum.tip_field import grid_normals
@@ -99,17 +94,9 @@ def make_tip_response(
 ) -> TipResponse:
     """Sample the self-compliance where a tip is carried; elsewhere its mean is used.
 
-    Parameters
-    ----------
-    surface : LoadSurface
-    field : TipField
-    carriers : TipCarriers
-    load : ndarray, shape (n_positions, 3, rank)
-        Far factor of the contact compliance.
-    near : LocalBlocks
-        Near part of the contact compliance [m/N].
-    modulus : float
-        E* [Pa].
+    load : ndarray, shape (n_positions, 3, rank), far factor of the contact compliance
+    near : near part of the contact compliance [m/N]
+    modulus : E* [Pa]
     """
     # Here, because the contact node needs none of it.
     from avatar_core.vademecum.tip_field import smoothed

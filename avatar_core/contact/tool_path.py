@@ -75,7 +75,6 @@ def slide(
 
     Parameters
     ----------
-    vademecum : Vademecum
     radius : float
         Radius of the tip [m].
     depth : float

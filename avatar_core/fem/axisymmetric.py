@@ -28,24 +28,14 @@ class AxisymmetricBody:
 
     Displacements (u_r, u_z) have the shape (n_nodes, 2), forces (2 n_nodes,).
 
-    Parameters
-    ----------
-    ticks : ndarray
-        Edges of the elements along r and along -z, rising from 0.
-    material : HyperelasticMaterial
+    ticks : ndarray, edges of the elements along r and along -z, rising from 0
 
-    Attributes
-    ----------
-    places : ndarray, shape (n_nodes, 2)
-        r and z of the nodes.
-    free : ndarray
-        Degrees of freedom that are neither clamped nor on the axis.
-    top : ndarray of int, shape (n_edges, 9)
-        Nodes of the elements at the surface z = 0.
-    top_shape : ndarray, shape (n_edges, n_points, 9)
-        Values of their shape functions at the quadrature points of the surface.
-    top_radius, top_area : ndarray, shape (n_edges, n_points)
-        r and 2 pi r dr at these points.
+    places : ndarray, shape (n_nodes, 2), r and z of the nodes
+    free : ndarray, degrees of freedom that are neither clamped nor on the axis
+    top : ndarray of int, shape (n_edges, 9), nodes of the elements at the surface z = 0
+    top_shape : ndarray, shape (n_edges, n_points, 9), values of their shape functions at the
+        quadrature points of the surface
+    top_radius, top_area : ndarray, shape (n_edges, n_points), r and 2 pi r dr at these points
     """
 
     def __init__(self, ticks: np.ndarray, material: HyperelasticMaterial) -> None:
@@ -101,12 +91,8 @@ class AxisymmetricBody:
     def factorize(self, u: np.ndarray, surface: np.ndarray) -> rslab.Ldlt:
         """Return LDL^T of the tangent over the free dofs.
 
-        Parameters
-        ----------
-        u : ndarray, shape (n_nodes, 2)
-            Displacement.
-        surface : ndarray, shape (n_edges, 18, 18)
-            Matrices that the surface adds to the tangent.
+        u : ndarray, shape (n_nodes, 2), displacement
+        surface : ndarray, shape (n_edges, 18, 18), matrices that the surface adds to the tangent
         """
         A = self.material.tangent(self.deformation_gradient(u))
         A = A[..., _ROW[:, None], _COLUMN[:, None], _ROW, _COLUMN] * self.volume[..., None, None]

@@ -136,8 +136,6 @@ class Elasticity:
 
     Parameters
     ----------
-    mesh : TetMesh
-    material : Material
     clamped : ndarray of bool, shape (n_faces,)
         Mask over ``mesh.boundary_faces``. Without clamp and supports the organ is free, and only
         :attr:`stiffness` can be used.
@@ -229,7 +227,6 @@ class Elasticity:
 
         Parameters
         ----------
-        material : Material
         contrast : float or None
             Contrast of the inclusion.
         stiffness : Mapping[str, float] or None

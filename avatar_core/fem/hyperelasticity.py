@@ -38,8 +38,6 @@ class Hyperelasticity:
 
     Parameters
     ----------
-    mesh : TetMesh
-    material : HyperelasticMaterial
     clamped : ndarray of bool, shape (n_faces,)
         Mask over ``mesh.boundary_faces``.
 

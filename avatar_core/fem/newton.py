@@ -96,7 +96,6 @@ def solve(problem: Hyperelasticity, load: np.ndarray, rule: NewtonRule | None = 
 
     Parameters
     ----------
-    problem : Hyperelasticity
     load : ndarray, shape (3 n_nodes,)
         Dead load [N].
     rule : NewtonRule or None
@@ -128,7 +127,6 @@ def press(
 
     Parameters
     ----------
-    problem : Hyperelasticity
     loads : ndarray, shape (3 n_nodes, m)
         C, unit loads of the patch: columns of ``patch_loads``, or combinations of them.
         ``State.force`` holds their factors [N].

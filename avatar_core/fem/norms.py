@@ -40,7 +40,6 @@ def mean_strain(mesh: TetMesh, displacement: FloatArray) -> float:
 
     Parameters
     ----------
-    mesh : TetMesh
     displacement : ndarray, shape (n_vertices, 3)
         Displacement [m], linear in each tetrahedron.
     """

@@ -246,7 +246,6 @@ def patch_normals(mesh: TetMesh, centers: np.ndarray, radius: float) -> np.ndarr
 
     Parameters
     ----------
-    mesh : TetMesh
     centers : ndarray, shape (n, 3)
         Patch centres [m].
     radius : float
@@ -270,7 +269,6 @@ def patch_loads(elasticity: Elasticity, centers: np.ndarray, radius: float) -> s
 
     Parameters
     ----------
-    elasticity : Elasticity
     centers : ndarray, shape (n, 3)
         Patch centres [m].
     radius : float

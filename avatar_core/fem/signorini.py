@@ -48,7 +48,6 @@ class Push:
 
     Attributes
     ----------
-    tip : Tip
     point : ndarray, shape (3,)
         x_0 on the surface, where the depth is zero [m].
     axis : ndarray, shape (3,)
@@ -257,12 +256,8 @@ def complementary(compliance: np.ndarray, needed: np.ndarray) -> np.ndarray:
     Source: Hintermueller, Ito & Kunisch, SIAM J. Optim. 13:865 (2002). If the set comes back to an
     earlier one, non-negative least squares find p: |L^T p - L^-1 b| with C = L L^T.
 
-    Parameters
-    ----------
-    compliance : ndarray, shape (n, n)
-        C, symmetric positive definite.
-    needed : ndarray, shape (n,)
-        b.
+    compliance : ndarray, shape (n, n), C, symmetric positive definite
+    needed : ndarray, shape (n,), b
 
     Raises
     ------

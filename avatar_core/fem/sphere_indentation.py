@@ -115,11 +115,9 @@ class SphereIndentation:
 
     Parameters
     ----------
-    poisson_ratio : float
     large_strain : bool
         Whether the material is neo-Hookean and contact is on the deformed surface; otherwise
         Sneddon's problem.
-    domain : Domain or None
     """
 
     def __init__(

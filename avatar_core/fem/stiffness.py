@@ -25,14 +25,9 @@ def unit_stiffness(
 ) -> tuple[sp.csr_matrix, sp.csr_matrix]:
     """Return the shear part for mu = 1 and the volumetric part for lambda = 1.
 
-    Parameters
-    ----------
-    basis : CellBasis
-        scikit-fem's scalar basis, whose quadrature is exact for products of gradients.
-    nodes : ndarray of int, shape (n_tets, n_shape)
-        Node of each shape function.
-    volume_fraction : ndarray, shape (n_tets,), or None
-        chi; None for 1.
+    basis : scikit-fem's scalar basis, whose quadrature is exact for products of gradients
+    nodes : ndarray of int, shape (n_tets, n_shape), node of each shape function
+    volume_fraction : ndarray, shape (n_tets,), or None, chi; None for 1
 
     Returns
     -------

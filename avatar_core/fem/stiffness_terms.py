@@ -43,17 +43,11 @@ def scalar_mass(u, v, w):  # type: ignore[no-untyped-def]
 class StiffnessTerms:
     """The constant matrices of a stiffness, common to all values of the material.
 
-    Parameters
-    ----------
-    mesh : TetMesh
-    quadratic : bool
-        Whether displacements are quadratic (P2, Taylor-Hood) or linear (P1).
-    volume_fraction : ndarray, shape (n_tets,)
-        Volume fraction of an inclusion in each tetrahedron, or None.
-    supported : Sequence[ndarray]
-        Vertices of the faces of each support, ndarrays of shape (n, 3).
-    resection : Resection or None
-        Resection that ties the sides of a cut, or None.
+    quadratic : whether displacements are quadratic (P2, Taylor-Hood) or linear (P1)
+    volume_fraction : ndarray, shape (n_tets,), volume fraction of an inclusion in each tetrahedron,
+        or None
+    supported : vertices of the faces of each support, ndarrays of shape (n, 3)
+    resection : resection that ties the sides of a cut, or None
     """
 
     def __init__(

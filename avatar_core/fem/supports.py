@@ -90,14 +90,9 @@ def _mass(u, v, w):  # type: ignore[no-untyped-def]
 def boundary_mass(mesh: MeshTet, shape: Element, faces: FloatArray) -> sp.csr_matrix:
     """Return int_faces N_a N_b da of one component, scikit-fem's numbering [m^2].
 
-    Parameters
-    ----------
-    mesh : MeshTet
-        scikit-fem's mesh.
-    shape : Element
-        Element of one component, of degree 1 or 2: quadrature of degree 4 is exact.
-    faces : ndarray of int, shape (n, 3)
-        Vertices of boundary faces.
+    mesh : scikit-fem's mesh
+    shape : element of one component, of degree 1 or 2: quadrature of degree 4 is exact
+    faces : ndarray of int, shape (n, 3), vertices of boundary faces
     """
     number = {tuple(facet): k for k, facet in enumerate(np.sort(mesh.facets, axis=0).T.tolist())}
     facets = np.array([number[tuple(face)] for face in np.sort(faces, axis=1).tolist()])
@@ -108,12 +103,8 @@ def boundary_mass(mesh: MeshTet, shape: Element, faces: FloatArray) -> sp.csr_ma
 class RigidMotion:
     """The rigid motion that supports resist least.
 
-    Attributes
-    ----------
-    resistance : float
-        Its Rayleigh quotient q [N/m^3].
-    text : str
-        Description of the motion.
+    resistance : its Rayleigh quotient q [N/m^3]
+    text : description of the motion
     """
 
     resistance: float

@@ -10,10 +10,7 @@ from skfem.refdom import RefTri
 def triangle_shape(barycentric: np.ndarray) -> np.ndarray:
     """Return the shape functions of the six-node triangle, the trace of a P2 element.
 
-    Parameters
-    ----------
-    barycentric : ndarray, shape (..., 3)
-        Coordinates (l0, l1, l2) that sum to one.
+    barycentric : ndarray, shape (..., 3), coordinates (l0, l1, l2) that sum to one
 
     Returns
     -------

@@ -58,18 +58,11 @@ def surface_of_label(
 ) -> tuple[Soup, tuple[str, ...]]:
     """Return the surface of labels, in RAS and the file's unit, and notices.
 
-    Parameters
-    ----------
-    path : Path
-    label : int or str or None
-        Number or name of a segment, or several with commas between; the only segment if None.
-    inside : Sequence[str]
-        Further labels, such as tumours. Gaps that they fill in the organ's label belong to the
+    label : number or name of a segment, or several with commas between; the only segment if None
+    inside : further labels, such as tumours. Gaps that they fill in the organ's label belong to the
         organ.
-    is_organ : bool
-        Whether notices report the labels read, cavities, and ends at the image's border.
-    mm : float
-        Length of the file's unit [mm].
+    is_organ : whether notices report the labels read, cavities, and ends at the image's border
+    mm : length of the file's unit [mm]
 
     Raises
     ------

@@ -85,14 +85,9 @@ def left_out(
 ) -> tuple[dict[str, float], list[str]]:
     """Return the labels that are cut out of the organ, and cavities that no label fills.
 
-    Parameters
-    ----------
-    cavity : ndarray of int
-        See :func:`cavities`.
-    layers : Iterable
-        Names of labels, and the number of each voxel's label: 0 for none, 1 for the first name.
-    ml : float
-        Volume of a voxel [ml].
+    cavity : ndarray of int, see :func:`cavities`
+    layers : names of labels, and the number of each voxel's label: 0 for none, 1 for the first name
+    ml : volume of a voxel [ml]
 
     Returns
     -------

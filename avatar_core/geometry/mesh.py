@@ -235,7 +235,6 @@ def tetrahedralize(surface: SurfaceMesh, n_vertices: int = 2850) -> TetMesh:
 
     Parameters
     ----------
-    surface : SurfaceMesh
     n_vertices : int
         Number of mesh vertices aimed at, met to about 10 %. The least that a surface allows is 600
         to 2,000.

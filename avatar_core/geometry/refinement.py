@@ -77,7 +77,6 @@ def refine(
 
     Parameters
     ----------
-    mesh : TetMesh
     regions : Regions
         Regions of ``mesh``.
     gradings : Sequence[Grading]

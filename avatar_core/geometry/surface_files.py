@@ -39,13 +39,9 @@ HEADER_BYTES = 1 << 16  # of a file in which its axes are looked for
 class Format:
     """Reader of one mesh format.
 
-    Attributes
-    ----------
-    read : Callable[[bytes], Soup]
-        Function that returns vertices (n, 3) and triangles (m, 3) of a file's content.
-    comments : Callable[[bytes], bytes] or None
-        Function that returns the part of a file's head that may state its axes; None if the format
-        has none.
+    read : function that returns vertices (n, 3) and triangles (m, 3) of a file's content
+    comments : function that returns the part of a file's head that may state its axes; None if the
+        format has none
     """
 
     read: Callable[[bytes], Soup]

@@ -37,12 +37,10 @@ def fill_box(
 ) -> tuple[FloatArray, NDArray[np.int32]]:
     """Fill the box around a surface with tetrahedra that follow it, the same ones each time.
 
-    Parameters
-    ----------
     vertices : ndarray, shape (n, 3)
     faces : ndarray of int, shape (m, 3)
-    edge, envelope : float
-        Edge length and farthest distance from the surface, over the diagonal of its box.
+    edge, envelope : edge length and farthest distance from the surface, over the diagonal of its
+        box
 
     Returns
     -------

@@ -82,7 +82,6 @@ def strained_fraction(
 
     Parameters
     ----------
-    tumour : SurfaceMesh
     points : ndarray, shape (n, 3)
         Points on the surface [m].
     normals : ndarray, shape (n, 3)

@@ -49,7 +49,6 @@ class Loop:
 
     Attributes
     ----------
-    device : Device
     stiffness : float
         Stiffness of the organ [N/m].
     delay : int
@@ -67,14 +66,9 @@ class Loop:
 class Trace(NamedTuple):
     """The course of a loop, period by period.
 
-    Attributes
-    ----------
-    position : ndarray
-        x before each period [m].
-    organ, held : ndarray
-        The organ's force at x, and F, which acts on the tool [N].
-    energy : ndarray
-        Energy that the tool has put into the port, after each period [J].
+    position : ndarray, x before each period [m]
+    organ, held : ndarray, the organ's force at x, and F, which acts on the tool [N]
+    energy : ndarray, energy that the tool has put into the port, after each period [J]
     """
 
     position: FloatArray

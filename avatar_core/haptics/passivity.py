@@ -85,7 +85,6 @@ def make_passivity(
 
     Parameters
     ----------
-    n_tools : int
     delay : int
         Number of periods from a pose until its force is held, known and constant.
     resolution : float

@@ -67,12 +67,7 @@ def full_response(elasticity: Elasticity, loads: sp.csr_matrix, progress: Progre
 
     Batches do not depend on the number of cores, nor do the bits of their solutions.
 
-    Parameters
-    ----------
-    elasticity : Elasticity
-    loads : sparse, shape (3 n_nodes, n_loads)
-        Three loads for each position.
-    progress : Progress
+    loads : sparse, shape (3 n_nodes, n_loads), three loads for each position
     """
     average, by_column, n = loads.T.tocsr(), loads.tocsc(), loads.shape[1]
     single = elasticity.single_serves(by_column)

@@ -53,14 +53,9 @@ _RANK_STEP = 5  # between the numbers of modes whose errors are reported
 class Modes:
     """K-orthonormal modes of all loads, sorted by displacement norm.
 
-    Attributes
-    ----------
-    space : ndarray, shape (3 n_nodes, rank)
-        X.
-    load : ndarray, shape (n_loads, rank)
-        Y = F^T X.
-    history : tuple[EnrichmentReport, ...]
-        History of the enrichments.
+    space : ndarray, shape (3 n_nodes, rank), X
+    load : ndarray, shape (n_loads, rank), Y = F^T X
+    history : history of the enrichments
     """
 
     space: np.ndarray

@@ -113,15 +113,12 @@ def contacts_at(
         Mesh of the organ.
     regions : Regions
         Regions of the mesh.
-    material : Material
     place : ndarray, shape (3,)
         Place on the surface (or the facets), where depths are zero [m].
     normal : ndarray, shape (3,)
         Outward normal. Tips are pushed in against it, and all tips but balls press along it.
-    tips : Sequence[Tip]
     depths : Sequence[float]
         Depths of a tip's lowest point below the place [m].
-    resolution : Resolution
     progress : Callable[[float], None] or None
         See :class:`avatar_core.fem.signorini.CondensedContact`.
     tumour : tuple[SurfaceMesh, float] or None

@@ -120,8 +120,6 @@ def held_at(
 
     Parameters
     ----------
-    mesh : TetMesh
-    options : Sequence[SupportOption]
     places : Mapping[str, ndarray]
         Faces of each support, ndarrays of bool, shape (n_faces,). Also ``clamped`` and
         ``accessible``, unless they are left to the supports and the rule.

@@ -29,7 +29,6 @@ def path_series(problem: Hyperelasticity, loads: FloatArray, order: int) -> Floa
 
     Parameters
     ----------
-    problem : Hyperelasticity
     loads : ndarray, shape (3 n_nodes, n)
         Dead loads of unit size, one path each.
     order : int

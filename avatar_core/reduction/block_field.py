@@ -203,7 +203,6 @@ def separate_field(
 
     Parameters
     ----------
-    blocks : Blocks
     volumes : ndarray, shape (n_vertices,)
         Weights of errors.
     region : ndarray of int32, shape (n_positions,)

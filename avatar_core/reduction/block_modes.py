@@ -24,17 +24,11 @@ from avatar_core.common.arrays import FloatArray, IntArray
 class BlockModes(NamedTuple):
     """The modes of a field in every block.
 
-    Attributes
-    ----------
-    space : ndarray of float32, shape (n, values of a block)
-        Z, each with a peak of 1.
-    core : ndarray of float32, shape (n, m)
-        C, from the amplitudes of m modes of the whole field.
-    level : ndarray of int32, shape (n,)
-        Rank at which this mode is first kept, averaged over blocks; from 1 on, ascending in each
-        block.
-    start : ndarray of int64, shape (n_blocks + 1,)
-        First mode of each block, the strongest first.
+    space : ndarray of float32, shape (n, values of a block), Z, each with a peak of 1
+    core : ndarray of float32, shape (n, m), C, from the amplitudes of m modes of the whole field
+    level : ndarray of int32, shape (n,), rank at which this mode is first kept, averaged over
+        blocks; from 1 on, ascending in each block
+    start : ndarray of int64, shape (n_blocks + 1,), first mode of each block, the strongest first
     """
 
     space: FloatArray
@@ -85,18 +79,11 @@ def separate_blocks(
 ) -> BlockModes:
     """Return the modes of every block.
 
-    Parameters
-    ----------
-    fields : ndarray, shape (n_blocks, values of a block, m)
-        B.
-    mass : ndarray, shape (n_blocks, values of a block)
-        Lumped mass, which weights errors.
-    loads : ndarray, shape (n_loads, m)
-        Amplitudes a for which the error is measured.
-    sizes : ndarray, shape (n_loads,)
-        L2 norms to which the errors of these loads are relative.
-    tolerance : float
-        Root mean square over the loads of the remaining relative L2 error.
+    fields : ndarray, shape (n_blocks, values of a block, m), B
+    mass : ndarray, shape (n_blocks, values of a block), lumped mass, which weights errors
+    loads : ndarray, shape (n_loads, m), amplitudes a for which the error is measured
+    sizes : ndarray, shape (n_loads,), L2 norms to which the errors of these loads are relative
+    tolerance : root mean square over the loads of the remaining relative L2 error
     """
     if fields.size == 0:
         return BlockModes.none(*fields.shape)

@@ -276,12 +276,10 @@ def reduce(
     elasticity : Elasticity
         Problem on the patient's own mesh.
     loads : sparse, shape (3 n_nodes, n_loads)
-    surface : LoadSurface
     load_functions : ndarray, shape (n_loads, n)
         Load functions of the neighbours, most important first.
     tolerance : float
         Mean relative L2 error of displacement.
-    rule : ReductionRule or None
     progress : Callable[[float, GalerkinErrorEstimate], None]
         Called with the spent fraction of the allowed solutions, and the estimate.
     """
@@ -419,7 +417,6 @@ def residual_compliance_blocks(
         M [m/N].
     support : float
         Distance at which phi vanishes [m].
-    surface : LoadSurface
     reach : float
         Largest distance of two patches with a block [m].
     """

@@ -48,7 +48,6 @@ class EnrichmentReport:
 
     Attributes
     ----------
-    status : EnrichmentStatus
     sweeps : int
         Number of alternating sweeps.
     modes : int
@@ -294,7 +293,6 @@ def solve_pgd(
     ----------
     problem : PGDProblem
         LoadProblem or SolvedLoads.
-    rule : PGDRule
     progress : Callable[[int], None]
         Called with the rank after every enrichment.
 

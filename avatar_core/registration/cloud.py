@@ -110,7 +110,6 @@ def read_cloud(path: str | Path, unit: str = "mm", axes: str | ArrayLike | None 
 
     Parameters
     ----------
-    path : str or Path
     unit : str
         Unit of the file's coordinates: "m", "cm" or "mm".
     axes : str or array_like or None

@@ -88,15 +88,9 @@ def smooth_loads(
 ) -> LoadBasis:
     """Return the smoothest tractions, and the turned weight; a pressure if along normals.
 
-    Parameters
-    ----------
-    vademecum : Vademecum
-    allowed : ndarray of bool, shape (n_positions,)
-        Mask of positions where loads may act.
-    along_normals : bool
-        Whether tractions act along the normals alone.
-    n : int
-        Number of functions.
+    allowed : ndarray of bool, shape (n_positions,), mask of positions where loads may act
+    along_normals : whether tractions act along the normals alone
+    n : number of functions
     """
     surface = vademecum.surface
     eigenvalues, functions, area = _eigenfunctions(surface, n)
@@ -127,16 +121,10 @@ def smooth_loads(
 class PointForces:
     """Places at which a force may act, each alone.
 
-    Attributes
-    ----------
-    positions : ndarray of int, shape (n,)
-        Load positions.
-    columns : ndarray, shape (n_vertices, 3, n, 3)
-        Displacement by a force at each place [m/N].
-    per_metre : ndarray, shape (n,)
-        Force that displaces the organ there by a unit [N/m].
-    n_positions : int
-        Number of load positions of the vademecum.
+    positions : ndarray of int, shape (n,), load positions
+    columns : ndarray, shape (n_vertices, 3, n, 3), displacement by a force at each place [m/N]
+    per_metre : ndarray, shape (n,), force that displaces the organ there by a unit [N/m]
+    n_positions : number of load positions of the vademecum
     """
 
     positions: IntArray
@@ -230,14 +218,9 @@ def moved_supports(vademecum: Vademecum, shift: float) -> LoadBasis:
 def allowed_at(surface: LoadSurface, forces: str, points: FloatArray | None = None) -> FloatArray:
     """Return the load positions where forces may act, ndarray of bool, shape (n_positions,).
 
-    Parameters
-    ----------
-    surface : LoadSurface
-    forces : str
-        "accessible", all positions; "seen", positions within reach of ``points``; or "near X Y Z
-        RADIUS", positions in a ball [m].
-    points : ndarray, shape (n, 3)
-        A cloud in the organ's frame at rest [m].
+    forces : "accessible", all positions; "seen", positions within reach of ``points``; or "near X Y
+        Z RADIUS", positions in a ball [m]
+    points : ndarray, shape (n, 3), A cloud in the organ's frame at rest [m]
 
     Raises
     ------

@@ -45,18 +45,12 @@ class Scales:
 class Equations:
     """The cloud's equations, as sums that do not depend on the scales.
 
-    Attributes
-    ----------
-    gram : ndarray, shape (n, n)
-        J^T W J.
-    right : ndarray, shape (n,)
-        J^T W d.
-    square : float
-        d^T W d.
-    cell_rows, cell_right, cell_weight : ndarray, shape (n_cells, n), (n_cells,), (n_cells,)
-        Sums of W J, W d and W over cells.
-    n_points, log_weights : int, float
-        Number of points, sum of log W.
+    gram : ndarray, shape (n, n), J^T W J
+    right : ndarray, shape (n,), J^T W d
+    square : d^T W d
+    cell_rows, cell_right, cell_weight : ndarray, shape (n_cells, n), (n_cells,), (n_cells,), sums
+        of W J, W d and W over cells
+    n_points, log_weights : number of points, sum of log W
     """
 
     gram: FloatArray
@@ -116,14 +110,9 @@ class Posterior:
 def posterior(found: Equations, spread: FloatArray, noise: float, mismatch: float) -> Posterior:
     """Solve the equations with a prior of standard deviations ``spread``.
 
-    Parameters
-    ----------
-    found : Equations
     spread : ndarray, shape (n,)
-    noise : float
-        sigma [m].
-    mismatch : float
-        tau [m].
+    noise : sigma [m]
+    mismatch : tau [m]
     """
     inverse = noise**-2
     taken = inverse**2 / (mismatch**-2 + inverse * found.cell_weight)  # Woodbury, cell by cell

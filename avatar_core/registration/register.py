@@ -195,7 +195,6 @@ class Registered:
 
         Parameters
         ----------
-        name : str
         vertices : ndarray of int, shape (n,)
         weights : ndarray, shape (n,)
         """
@@ -276,7 +275,6 @@ def register(
 
     Parameters
     ----------
-    vademecum : Vademecum
     cloud : Cloud or array_like, shape (n, 3)
         Points in any order [m], at least 50, aligned to about 10 mm and 10 degrees.
     rule : RegistrationRule, optional

@@ -28,12 +28,9 @@ _GAIN = 5.0  # of the log likelihood, that one more force needs
 class Noise:
     """The error of the cloud: E^-1 without a dense matrix; see :mod:`posterior`.
 
-    Attributes
-    ----------
     weights : ndarray, shape (n_points,)
     cells : sparse, shape (n_cells, n_points)
-    noise, mismatch : float
-        sigma, tau [m].
+    noise, mismatch : sigma, tau [m]
     """
 
     weights: FloatArray
@@ -68,17 +65,11 @@ def find_sites(
 ) -> Found:
     """Return the places of forces that explain a cloud.
 
-    Parameters
-    ----------
-    common : ndarray, shape (n_points, m)
-        Rows of the rigid motion times prior deviations.
-    rows : ndarray, shape (n_points, n_places, 3)
-        Rows of a force at each place, times prior deviations.
-    data : ndarray, shape (n_points,)
-        Distances [m].
-    error : Noise
-    most : int
-        Largest number of forces.
+    common : ndarray, shape (n_points, m), rows of the rigid motion times prior deviations
+    rows : ndarray, shape (n_points, n_places, 3), rows of a force at each place, times prior
+        deviations
+    data : ndarray, shape (n_points,), distances [m]
+    most : largest number of forces
     """
     n_points, n_places, _ = rows.shape
     own, shared = error.weighed(rows.reshape(n_points, -1).astype(np.float32))

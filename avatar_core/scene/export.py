@@ -30,7 +30,6 @@ def export(
 
     Parameters
     ----------
-    vademecum : Vademecum
     path : str or Path
         File to write, .vtu or .xdmf.
     point : array_like, shape (3,), or None

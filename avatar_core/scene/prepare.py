@@ -88,8 +88,6 @@ def scene_spec(
 
     Parameters
     ----------
-    vademecum : Vademecum
-    scene : Scene
     values : Mapping[str, float] or None
         Values of the material, by coordinate; they override those of the scene.
 
@@ -118,7 +116,6 @@ def prepare(
 
     Parameters
     ----------
-    vademecum : Vademecum
     scene : Scene or None
         None for one spherical tip of 5 mm and the effects that the vademecum requires.
     budget : Budget or None

@@ -66,8 +66,6 @@ def replay(
 
     Parameters
     ----------
-    recording : Recording
-    vademecum : Vademecum
     progress : Callable[[int, int], None] or None
         Called with the number of computed periods, and of all.
 

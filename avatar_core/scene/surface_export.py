@@ -37,7 +37,6 @@ def write_surfaces(
 
     Parameters
     ----------
-    vademecum : Vademecum
     path : str or Path
         File of the organ, .stl, .obj or .vtp.
     points : ndarray, shape (n, 3)

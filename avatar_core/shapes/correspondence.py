@@ -58,7 +58,6 @@ def carry_faces(
 
     Parameters
     ----------
-    registration : Registration
     patient : TetMesh
         Mesh of the surface that was registered to.
     parts : Mapping[str, ndarray of bool]
@@ -144,7 +143,6 @@ def load_map(registration: Registration, loads: LoadSurface, points: FloatArray)
 
     Parameters
     ----------
-    registration : Registration
     loads : LoadSurface
         Load positions of the template's mesh and regions.
     points : ndarray, shape (n, 3)

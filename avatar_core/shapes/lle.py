@@ -214,7 +214,6 @@ class LLE:
         ----------
         X : array_like, shape (n, D)
             One shape a row, or n arrays of shape (D,). Arrays of float64 are not copied.
-        y : ignored
         gram : Gram, optional
             Their inner products, if known.
 

@@ -46,7 +46,6 @@ class Template:
     ----------
     name : str
         Name of the organ it was made from.
-    mesh : TetMesh
     regions : Regions
         Clamp and accessible faces over ``mesh.boundary_faces``.
     """
@@ -205,12 +204,10 @@ class Registration:
 
     Attributes
     ----------
-    template : Template
     mesh : TetMesh
         The template's tetrahedra with moved vertices.
     alignment : SimilarityTransform
         Similarity from which the elastic registration started.
-    quality : RegistrationQuality
     history : tuple[RegistrationStep, ...]
         One entry per step.
     converged : bool

@@ -29,17 +29,10 @@ _PIECES = 3  # a template face is sampled at the centroids of this number square
 class Target:
     """A surface with evenly distributed samples.
 
-    Attributes
-    ----------
-    surface : SurfaceMesh
-    points : ndarray, shape (n, 3)
-        Samples [m].
-    normals : ndarray, shape (n, 3)
-        Unit normals, outward by the winding number.
-    volume : float
-        Enclosed volume [m^3].
-    center : ndarray, shape (3,)
-        Its centroid [m].
+    points : ndarray, shape (n, 3), samples [m]
+    normals : ndarray, shape (n, 3), unit normals, outward by the winding number
+    volume : enclosed volume [m^3]
+    center : ndarray, shape (3,), its centroid [m]
     """
 
     surface: SurfaceMesh
@@ -118,18 +111,12 @@ def _facing(
 class Springs:
     """Pairs of a point on the template, sum_k barycentric_k x_node_k, and its anchor on the target.
 
-    Attributes
-    ----------
-    nodes : ndarray of int, shape (m, 3)
-        Vertices of the template's face.
-    barycentric : ndarray, shape (m, 3)
-        Coordinates of the point in the face.
-    anchors : ndarray, shape (m, 3)
-        Anchors on the target [m].
-    normals : ndarray, shape (m, 3)
-        Unit normals at the anchors.
-    weights : ndarray, shape (m,)
-        Stiffness of each spring; the springs from each surface sum to one.
+    nodes : ndarray of int, shape (m, 3), vertices of the template's face
+    barycentric : ndarray, shape (m, 3), coordinates of the point in the face
+    anchors : ndarray, shape (m, 3), anchors on the target [m]
+    normals : ndarray, shape (m, 3), unit normals at the anchors
+    weights : ndarray, shape (m,), stiffness of each spring; the springs from each surface sum to
+        one
     """
 
     nodes: IntArray
@@ -171,15 +158,9 @@ def surface_springs(
 ) -> Springs:
     """Return springs from the template's vertices to the target, and back from every third sample.
 
-    Parameters
-    ----------
-    positions : ndarray, shape (n_vertices, 3)
-        Current positions of the template's vertices [m].
-    mesh : TetMesh
-    target : Target
-    normal_length : float or None
-        Weight of the normals in the distance [m]. None connects the vertices to the closest point
-        of the target's triangles, whatever its normal.
+    positions : ndarray, shape (n_vertices, 3), current positions of the template's vertices [m]
+    normal_length : weight of the normals in the distance [m]. None connects the vertices to the
+        closest point of the target's triangles, whatever its normal.
     """
     faces, own = mesh.boundary_faces, mesh.surface_vertices
     face_normals = _area_normals(positions, faces)

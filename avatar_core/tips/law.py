@@ -111,7 +111,6 @@ def law_arrays(
 
     Parameters
     ----------
-    tips : Sequence[Tip]
     material : Material
         Material of the organ.
     local : ndarray of float32, shape (2, nx, ny, nz)

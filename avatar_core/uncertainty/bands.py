@@ -63,7 +63,6 @@ def force_bands(
 
     Parameters
     ----------
-    vademecum : Vademecum
     known : mapping of str to Distribution
         Young's modulus and coordinates of the vademecum, by name. A parameter that is not given
         keeps the vademecum's value.

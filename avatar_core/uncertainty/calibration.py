@@ -96,7 +96,6 @@ class TouchTable:
 
     Attributes
     ----------
-    grid : MaterialGrid
     palpation : Palpation
         Touches that meet the organ in the vademecum.
     left_out : int
@@ -152,7 +151,6 @@ class TouchTable:
 
         Parameters
         ----------
-        errors : TouchErrors
         log_force : ndarray, shape (n_samples,)
             Logarithm of the expected forces.
         inflated : ndarray or None, shape (n_touches,)
@@ -240,7 +238,6 @@ def calibrate(
 
     Parameters
     ----------
-    vademecum : Vademecum
     tips : array_like, shape (n, 3)
         Places of the tip in the order of time [m], as :func:`avatar_core.contact.model.step` takes
         them. Each touch begins outside the organ.
@@ -367,10 +364,8 @@ def calibrated(
 
     Parameters
     ----------
-    table : TouchTable
     known : Mapping[str, Distribution]
         Prior of every coordinate and "young", see :func:`avatar_core.uncertainty.known.known_of`.
-    errors : TouchErrors or None
     """
     names = tuple(name for name, one in known.items() if not isinstance(one, Fixed))
     errors = errors or TouchErrors()

@@ -36,16 +36,10 @@ def chance(
 ) -> float:
     """Return the probability that a fit is as bad by chance, from the worse of both tests.
 
-    Parameters
-    ----------
-    deviations : ndarray, shape (n,)
-        d of each touch.
-    places : ndarray, shape (n, 3)
-        Places of the touches [m].
-    derivatives : ndarray, shape (n, n_parameters)
-        G.
-    freedom : float
-        Degrees of freedom of Student's t.
+    deviations : ndarray, shape (n,), d of each touch
+    places : ndarray, shape (n, 3), places of the touches [m]
+    derivatives : ndarray, shape (n, n_parameters), G
+    freedom : degrees of freedom of Student's t
     """
     scores = normal_scores(deviations, freedom)
     n_left = max(len(scores) - derivatives.shape[1], 1)

@@ -60,7 +60,6 @@ def log_edges(
     ----------
     vademecum : Vademecum
         Vademecum at any values.
-    tips : Sequence[Tip]
     known : Mapping[str, Distribution]
         Distributions of all its parameters, by :func:`avatar_core.uncertainty.known.known_of`.
     draws, seed : int
@@ -99,8 +98,6 @@ def force_spread_at(
 
     Parameters
     ----------
-    vademecum : Vademecum
-    tip : Tip
     known : Mapping[str, Distribution]
         Distributions of all its parameters, by :func:`avatar_core.uncertainty.known.known_of`.
     points : ndarray, shape (n, 3)

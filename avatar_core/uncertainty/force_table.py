@@ -31,15 +31,10 @@ _STEP = 2e-3  # in which it comes down, at most: it must not be taken for one th
 class ForceTable:
     """Forces and displacements at the points of a grid of materials.
 
-    Attributes
-    ----------
-    grid : MaterialGrid
-    places : ndarray, shape (n_places, 3)
-        Load positions that are pressed [m].
-    log_force : ndarray, shape (n_points, n_places, n_depths)
-        Logarithm of the force [N].
-    log_moved : ndarray, shape (n_points, n_places, n_depths)
-        Logarithm of the displacement of the target [m].
+    places : ndarray, shape (n_places, 3), load positions that are pressed [m]
+    log_force : ndarray, shape (n_points, n_places, n_depths), logarithm of the force [N]
+    log_moved : ndarray, shape (n_points, n_places, n_depths), logarithm of the displacement of the
+        target [m]
     """
 
     grid: MaterialGrid
@@ -73,8 +68,6 @@ def force_table(
 
     Parameters
     ----------
-    vademecum : Vademecum
-    tip : Tip
     places : Sequence[int]
         Load positions.
     depths : Sequence[float]

@@ -31,14 +31,9 @@ _FEWER, _LEAST = {3: 4}, 3  # for each of three, of more
 class MaterialGrid:
     """Chebyshev's points of coordinates of a vademecum.
 
-    Attributes
-    ----------
-    coordinates : tuple[Coordinate, ...]
-        All coordinates of the vademecum, or some.
-    young : float
-        Young's modulus at the points, E0 [Pa].
-    n_each : int
-        Number of points for each coordinate.
+    coordinates : all coordinates of the vademecum, or some
+    young : Young's modulus at the points, E0 [Pa]
+    n_each : number of points for each coordinate
     """
 
     coordinates: tuple[Coordinate, ...]

@@ -45,14 +45,9 @@ _PAUSE = 0.1  # for which a sample stands, at most [s]
 class Sensed:
     """Forces on a path as a sensor with the right zero and no lag would have measured them.
 
-    Attributes
-    ----------
-    size : ndarray, shape (n,)
-        Size [N]; NaN where it is not known.
-    lost : float
-        Part of the work of the way in that the way out does not give back.
-    notices : tuple[str, ...]
-        What was corrected, one line each.
+    size : ndarray, shape (n,), size [N]; NaN where it is not known
+    lost : part of the work of the way in that the way out does not give back
+    notices : what was corrected, one line each
     """
 
     size: FloatArray

@@ -54,7 +54,6 @@ class CurvePoint:
 
     Attributes
     ----------
-    detail : Detail
     l2 : float
         Relative error of the cloud's displacement under the computed force, which 95 % of unseen
         contacts stay below; NaN for no cloud.
@@ -122,7 +121,6 @@ class AccuracyCurve:
 
     Attributes
     ----------
-    points : tuple[CurvePoint, ...]
     n_errors : int
         Number of unseen contacts behind each error.
     machine : str

@@ -74,7 +74,6 @@ def organ_display(
 
     Parameters
     ----------
-    mesh : TetMesh
     surface : SurfaceMesh or None
         Surface that the mesh was made from; None for the mesh's own boundary, refined.
     n : int

@@ -65,7 +65,6 @@ def body_functions(elasticity: Elasticity, space: np.ndarray) -> np.ndarray:
 
     Parameters
     ----------
-    elasticity : Elasticity
     space : ndarray, shape (3 n_nodes, rank)
         K-orthonormal modes.
 

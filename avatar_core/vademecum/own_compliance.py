@@ -23,7 +23,6 @@ def own_compliance_at(vademecum: Vademecum, values: Mapping[str, float]) -> np.n
 
     Parameters
     ----------
-    vademecum : Vademecum
     values : Mapping[str, float]
         Values of all coordinates, by name; within their ranges.
     """

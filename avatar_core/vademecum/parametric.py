@@ -99,7 +99,6 @@ def galerkin_field(
 
     Parameters
     ----------
-    found : GalerkinBasis
     root : ndarray
         L, of :func:`stiffness_root`.
 
@@ -142,7 +141,6 @@ def regional_load_of_basis(
 
     Parameters
     ----------
-    found : GalerkinBasis
     projection : ndarray, shape (n_regions, most, n)
         Functions of the basis in the modes of each region.
     root, trailing : ndarray
@@ -170,7 +168,6 @@ def field_at(field: BlockField, core: np.ndarray, root: np.ndarray, load: np.nda
 
     Parameters
     ----------
-    field : BlockField
     core : ndarray
         Core of V.
     root : ndarray

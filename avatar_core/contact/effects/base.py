@@ -23,22 +23,14 @@ if TYPE_CHECKING:
 class Ground:
     """The inputs from which an effect lays out its arrays.
 
-    Attributes
-    ----------
-    vademecum : Vademecum
-        Vademecum after adaptation by the scene's effects.
-    tips, effects : Sequence[Tip], Sequence[Effect]
-        Tips and effects of the scene.
-    response : TipResponse
-        Response of the organ, on the grid of its tip field.
-    n_modes : int
-        Number of modes of the contact compliance, with the zero modes that fill up a row.
-    reach : float
-        Longest distance between the two positions of a block of the near field [m].
-    large_start : ndarray, shape (n_regions + 1,)
-        First mode of large deformation of each region, among those of the cloud.
-    period : float
-        Period of the steps [s].
+    vademecum : vademecum after adaptation by the scene's effects
+    tips, effects : tips and effects of the scene
+    response : response of the organ, on the grid of its tip field
+    n_modes : number of modes of the contact compliance, with the zero modes that fill up a row
+    reach : longest distance between the two positions of a block of the near field [m]
+    large_start : ndarray, shape (n_regions + 1,), first mode of large deformation of each region,
+        among those of the cloud
+    period : period of the steps [s]
     """
 
     vademecum: Vademecum

@@ -434,7 +434,7 @@ def test_values_near_whole_numbers_are_labels_and_others_are_not(tmp_path):
     near[:2, :2, :2] = 0.9882
     path = nifti(tmp_path / "near.nii", near)
     assert labels_of(path) == ("1", "2")
-    assert "such as 2.023 are read as the nearest whole" in read_surface(path, label=2).notices[0]
+    assert "like 2.023 are read as the nearest whole" in read_surface(path, label=2).notices[0]
     scaled = nibabel.Nifti1Image(10 * ellipsoid().astype(np.int16), PLACE)
     scaled.header.set_slope_inter(0.1, 0.0)
     nibabel.save(scaled, tmp_path / "scaled.nii")
