@@ -71,7 +71,7 @@ class LargeRule:
 class _Paths:
     """Terms of all load positions.
 
-    Of pushes, then of pulls.
+    Pushes, then pulls.
 
     fields : ndarray float32, shape (2, 2, n_positions, 3 n_vertices), V_k [m^(1-k)]
     depth : ndarray, shape (2, 2, n_positions), beta_k; reach : (2, n_positions), a_max [m]
