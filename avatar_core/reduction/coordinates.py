@@ -12,7 +12,7 @@ weights are those of (multi)linear interpolation in
 
 Canonical PGD, one product of functions of place, load and each coordinate, is not used. It needs
 several times as many modes. It also stagnates at 13 % of the displacement towards
-incompressibility, where the energy norm contains little but the change of volume.
+incompressibility, where the energy norm measures only the change of volume.
 """
 
 from __future__ import annotations
