@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 atlas = typer.Typer(
-    help="Build and inspect atlases: known organs from which patients are made.",
+    help="Build and inspect atlases of known organs.",
     no_args_is_help=True,
     rich_markup_mode=None,  # markup would remove units like [m]
 )
@@ -71,10 +71,11 @@ def create(
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Build an atlas from surfaces. Bad surfaces are skipped, with the reason.
+    """Build an atlas from surfaces.
 
-    Each organ is written as soon as it is finished, and the same command goes on after an
-    interruption. Exit code 1: no surface could be used, and nothing was written.
+    Bad surfaces are skipped, with the reason. Each organ is written as soon as it is finished, and
+    the same command goes on after an interruption. Exit code 1: no surface could be used, and
+    nothing was written.
     """
     from avatar_core.atlas.growth import AtlasOptions, create_atlas
 
@@ -96,9 +97,10 @@ def add(
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Add surfaces to an atlas. Existing members are neither computed nor written again.
+    """Add surfaces to an atlas.
 
-    To remove an organ, delete its folder. Exit code 1: no surface could be used.
+    Existing members are neither computed nor written again. To remove an organ, delete its folder.
+    Exit code 1: no surface could be used.
     """
     from avatar_core.atlas.growth import extend_atlas
 
@@ -109,7 +111,7 @@ def add(
 
 @atlas.command()
 def show(folder: AtlasFolder, as_json: AsJson = False) -> None:
-    """Show the members of an atlas, with the quality of their registrations."""
+    """Show an atlas and its registrations."""
     from avatar_core.atlas.storage import load_atlas, n_bytes
 
     about = summary(load_atlas(folder), n_bytes(folder))

@@ -56,9 +56,10 @@ def bench_step(
     ] = None,
     output: Json = None,
 ) -> None:
-    """Time the contact step, a dense table and a direct solve (building takes a minute).
+    """Time the contact step and its rivals.
 
-    For a vademecum (.h5): the step with its own displayed surface, and a dense table.
+    The rivals are a dense table and a direct solve; building takes a minute. For a vademecum (.h5):
+    the step with its own displayed surface, and a dense table.
     """
     from avatar_core.geometry.resampling import require_displayable
     from avatar_core.studies.bench.methods import load_average
@@ -99,9 +100,10 @@ def bench_effects(
     modes: Annotated[int, typer.Option(help="largest number of modes at a place")] = 100,
     output: Json = None,
 ) -> None:
-    """Time the step without effects, with each one, and with all (building takes minutes).
+    """Time the step with each effect.
 
-    For a vademecum (.h5): with the effects that it supports.
+    The step is timed without effects, with each one, and with all; building takes minutes. For a
+    vademecum (.h5): with the effects that it supports.
     """
     from avatar_core.studies.bench.effects import build_for_effects, run_effects_bench
     from avatar_core.studies.bench.methods import load_average
@@ -158,10 +160,10 @@ def bench_cell(
     ] = 0.0,
     output: Json = None,
 ) -> None:
-    """Time the whole ROS 2 cell: tool, contact and cloud subscriber as separate processes.
+    """Time the whole ROS 2 cell.
 
-    Also reports whether memory, open files or threads of a process keep growing. Run it with
-    --seconds 600 for a soak test.
+    Tool, contact and cloud subscriber are separate processes. Also reports whether memory, open
+    files or threads of a process keep growing. Run it with --seconds 600 for a soak test.
     """
     import tempfile
 
@@ -191,7 +193,10 @@ def bench_start(
     ],
     output: Json = None,
 ) -> None:
-    """Time a cell from `avatar cell` to the first force, stage by stage."""
+    """Time a cell's start, stage by stage.
+
+    Stages run from `avatar cell` to the first force.
+    """
     require_ros()
     _require_json(output, vademecum)
     _run_module("start", [str(vademecum.resolve())], output)
@@ -211,7 +216,10 @@ def bench_idle(
     ] = None,
     output: Json = None,
 ) -> None:
-    """Print the processor use of each thread of the nodes while there is nothing to do."""
+    """Print the processor use of idle nodes.
+
+    Each thread of the nodes is measured while there is nothing to do.
+    """
     require_ros()
     _require_json(output, atlas)
     options = ["--atlas", str(atlas.resolve())] if atlas is not None else []

@@ -86,7 +86,11 @@ def calibrate(
         bool, typer.Option("--set", help="set the values in the running contact node")
     ] = False,
 ) -> None:
-    """Find Young's modulus and the coordinates of a vademecum from touches with measured forces."""
+    """Find material values from measured forces.
+
+    The forces are those of some touches. The values are Young's modulus and the coordinates of a
+    vademecum.
+    """
     from avatar_core.bags.touched import TouchFile, palpated, read_touched
     from avatar_core.uncertainty.calibration import TouchErrors, calibrated, touch_table
     from avatar_core.uncertainty.calibration_report import say

@@ -22,7 +22,7 @@ _AGAIN = 1.0  # after which a cell that has not ended is interrupted again [s]
 Host = Annotated[
     str, typer.Option(help="network address of the page; 0.0.0.0: all interfaces, without TLS")
 ]
-Port = Annotated[int, typer.Option(help="port of the page, or the next free one")]
+Port = Annotated[int, typer.Option(help="port of the page; if it is taken, the next free port")]
 
 
 def cell(
@@ -68,11 +68,12 @@ def cell(
     host: Host = "127.0.0.1",
     port: Port = 8080,
 ) -> None:
-    """Run the loader, the contact node and, with an atlas, the patient node, until Ctrl-C.
+    """Run the nodes of a planning cell.
 
-    Options override the parameter file. Without both, the library is the current folder. A node
-    that dies is started again. A node that refuses to start, or is told to end, ends all. In other
-    respects the command equals `ros2 launch avatar_ros planning_cell.launch.py`.
+    The loader, the contact node and, with an atlas, the patient node run until Ctrl-C. Options
+    override the parameter file. Without both, the library is the current folder. A node that dies
+    is started again. A node that refuses to start, or is told to end, ends all. In other respects
+    the command equals `ros2 launch avatar_ros planning_cell.launch.py`.
     """
     require_ros()
     page = {"host": host, "port": str(port)} if ui else {}

@@ -49,9 +49,10 @@ def export(
         str, typer.Option(help="axes of surfaces: LPS or RAS, stated in the file's header")
     ] = "LPS",
 ) -> None:
-    """Export an organ under a load for ParaView or 3D Slicer, or a recording as MCAP.
+    """Export an organ for ParaView or 3D Slicer.
 
-    The suffix of the output chooses: a mesh, deformed surfaces, or a bag of ROS 2.
+    The organ is under a load. The suffix of the output chooses a mesh (ParaView) or deformed
+    surfaces (3D Slicer). A recording is exported as MCAP, a bag of ROS 2.
     """
     from avatar_core.bags.files import MCAP
     from avatar_core.contact.tool_path import middle_of_access

@@ -86,7 +86,10 @@ def demo(
     host: Host = "127.0.0.1",
     port: Port = 8080,
 ) -> None:
-    """Demonstrate everything: build the phantom, press it at 1 kHz over ROS 2, draw a picture."""
+    """Build, press and draw the built-in liver.
+
+    The phantom is pressed at 1 kHz over ROS 2. A picture shows the result.
+    """
     import tempfile
 
     from avatar_core.cli.picture import palpation_picture

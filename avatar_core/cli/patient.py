@@ -83,7 +83,10 @@ def patient(
     timings: Timings = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Build a patient's vademecum from an atlas. Exit code 3: written, but not converged."""
+    """Build a patient's vademecum from an atlas.
+
+    Exit code 3: written, but not converged.
+    """
     from avatar_core.atlas.base import base_of, numbers_of
     from avatar_core.atlas.patient import PatientOptions, patient_vademecum, require_fidelity
     from avatar_core.atlas.storage import load_atlas

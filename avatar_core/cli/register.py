@@ -106,10 +106,11 @@ def register(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Bring an organ to a cloud of points on its deformed surface, and tell where its tumour is.
+    """Register an organ to points on its surface.
 
-    Exit code 3: the model does not explain the cloud, and nothing is written. Exit code 4: written,
-    but the unseen part, or a target, is not determined.
+    The organ is brought to a cloud of points on its deformed surface. The output tells where its
+    tumour is. Exit code 3: the model does not explain the cloud, and nothing is written. Exit code
+    4: written, but the unseen part, or a target, is not determined.
     """
     from avatar_core.registration.cloud import read_cloud
     from avatar_core.registration.fit import RegistrationRule

@@ -63,7 +63,10 @@ def replay(
         ),
     ] = "sigma",
 ) -> None:
-    """Compute the forces along a recorded path again, and compare them with the recorded ones."""
+    """Compute the forces of a recording again.
+
+    They are compared with the recorded ones.
+    """
     from avatar_core.bags.files import is_bag
     from avatar_core.haptics.force_guard import DEVICES
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
 
 scene = typer.Typer(
-    help="Inspect scenes: YAML files that name organ, tools, outputs and effects.",
+    help="Inspect scenes: organ, tools, effects (YAML).",
     no_args_is_help=True,
     rich_markup_mode=None,  # markup would remove units like [m]
 )
@@ -48,7 +48,10 @@ def check(
         typer.Option(help="vademecum (.h5) to check the scene against; its step is then timed"),
     ] = None,
 ) -> None:
-    """Show what a scene contains, how its effects combine, and what a step costs."""
+    """Show a scene, and time its step.
+
+    The output lists its content, how its effects combine, and what a step costs.
+    """
     from avatar_core.scene.file import read_scene, scene_path
     from avatar_core.vademecum.storage import load_vademecum
 

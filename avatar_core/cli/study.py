@@ -35,7 +35,10 @@ def study(
         bool, typer.Option("--resume", help="go on with an interrupted meshes or transport study")
     ] = False,
 ) -> None:
-    """Measure the claims of avatar, or repeat an experiment of the paper beside its figures."""
+    """Run a study of avatar or of the paper.
+
+    A study measures a claim of avatar, or repeats an experiment of the paper beside its figures.
+    """
     if name not in NAMES:
         print(f"avatar: no study '{name}'; choose one of {', '.join(NAMES)}", file=sys.stderr)
         raise typer.Exit(USAGE)

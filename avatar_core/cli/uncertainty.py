@@ -55,7 +55,11 @@ def uncertainty(
     ] = None,
     seed: Annotated[int, typer.Option(help="seed of the draws")] = 0,
 ) -> None:
-    """Show the bands of force and displacement, and the parameters that make them wide."""
+    """Show bands of force and displacement.
+
+    The data are known as distributions only. The output also names parameters that make the
+    bands wide.
+    """
     from avatar_core.geometry.tip import Tip
     from avatar_core.uncertainty.bands import force_bands
     from avatar_core.uncertainty.known import known_of

@@ -179,7 +179,10 @@ def vademecum(
     timings: Timings = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Build the certified vademecum of an organ. Exit code 3: written, but not converged."""
+    """Build the certified vademecum of an organ.
+
+    Exit code 3: written, but not converged.
+    """
     from avatar_core.fem.elasticity import Material
     from avatar_core.geometry.cut_surface import CutSurface
     from avatar_core.offline.large_deformation import LargeRule
@@ -261,7 +264,7 @@ def vademecum(
 
 
 def show(file: File, as_json: AsJson = False) -> None:
-    """Show a vademecum's contents, its certified errors, and the cost of its build."""
+    """Show contents, errors and cost of a vademecum."""
     from avatar_core.vademecum.storage import load_vademecum
 
     v = load_vademecum(file)
