@@ -1,5 +1,7 @@
 """Patient avatars: an organ becomes a vademecum that answers a haptic tool at 1 kHz.
 
+::
+
     import avatar_core as av
 
     surface = av.read_surface("liver.obj")          # metres, RAS

@@ -54,26 +54,49 @@ _RECORDED = ("avatar", "numpy", "scipy", "scikit-fem", "libigl", "pytetwild", "r
 class OrganOptions:
     """How an organ becomes a vademecum; the defaults are the paper's liver.
 
-    n_vertices : of the mesh, about
+    Parameters
+    ----------
+    n_vertices : int
+        Number of vertices of the mesh, about.
     material : Material
-    element : None for the one that does not lock at the material's Poisson's ratio
-    patch_radius : of the tool's traction [m]; None for max(12 mm, 1.2 x surface edge)
-    groups : file of node groups for clamp, accessible region and supports; None for the rules
-    supports : springs that hold the organ instead of the clamp
-    resection : surface that the organ is cut along, whose opening is a coordinate; None for none
+        Linear elastic material of the organ.
+    element : Element or None
+        Finite element. None takes the one that does not lock at the material's Poisson's ratio.
+    patch_radius : float or None
+        Radius of the loads [m]. None takes max(12 mm, 1.2 x surface edge).
+    groups : Path or None
+        File of node groups for clamp, accessible region and supports. None takes the rules.
+    supports : tuple of SupportOption
+        Springs that hold the organ instead of the clamp.
+    resection : CutSurface or None
+        Surface along which the organ is cut. How far it is opened is a coordinate.
     rule : BuildRule
-    coordinates : of the material, that stay free in the vademecum;
-        :mod:`avatar_core.reduction.coordinates`
-    tumour : surface inside the organ, with another stiffness; ``contrast`` of Young's moduli
-    large : material of large strains, with which the load's magnitude becomes a coordinate up to
-        the depth ``large_rule.max_push``; None for small strains
-    n_pushed : unseen sites at which large deformation is certified, four nonlinear solutions each;
-        at the first ``COMBINED_SITES`` together with other effects too, nine more each
-    n_certified : unseen load positions of the certificate; ``seed`` draws them
-    n_contact_sites : places, 0 or at least 3, at which contacts of real tips are resolved for the
-        certificate; ``seed`` draws them too
-    with_mesh_error : also solve on the same mesh refined once (slow)
-    n_displayed : vertices of the surface that is displayed, about; 0 for that of the mesh
+        Tolerance and numbers of modes.
+    coordinates : tuple of Coordinate
+        Parameters of the material that stay free in the vademecum.
+    tumour : SurfaceMesh or None
+        Surface inside the organ, with another stiffness.
+    contrast : float
+        Young's modulus inside the tumour over that outside.
+    large : LargeMaterial or None
+        Material of large strains; the load's magnitude then is a coordinate up to the depth
+        ``large_rule.max_push``. None for small strains.
+    large_rule : LargeRule
+        Depth and tolerances of large deformation.
+    n_pushed : int
+        Number of unseen sites at which large deformation is certified, by four nonlinear solutions
+        each. The first ``COMBINED_SITES`` are certified together with other effects too, by nine
+        more each.
+    n_certified : int
+        Number of unseen load positions of the certificate.
+    n_contact_sites : int
+        Number of places, 0 or at least 3, at which the certificate resolves contacts of real tips.
+    seed : int
+        Seed of the places of the certificate.
+    with_mesh_error : bool
+        Solve on the same mesh refined once, too (slow).
+    n_displayed : int
+        Number of vertices of the displayed surface, about. 0 takes that of the mesh.
 
     Raises
     ------

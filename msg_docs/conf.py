@@ -18,6 +18,8 @@ html_theme = "furo"
 html_title = "avatar"
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # docstrings give types, shapes and units
+napoleon_custom_sections = [("Attributes", "params_style")]
+suppress_warnings = ["ref.python"]  # "shape" of an array is no reference to any ``shape``
 
 
 def as_on_github(app, docname, source):
@@ -31,6 +33,12 @@ def as_on_github(app, docname, source):
         app.env.note_dependency(ROOT / "README.md")
 
 
+def norms_as_text(app, what, name, obj, options, lines):
+    """Escape the bars of |x|, which reStructuredText takes for a substitution."""
+    lines[:] = [re.sub(r"(``.*?``)|\|", lambda m: m[1] or r"\|", one) for one in lines]
+
+
 def setup(app):
     """Register what is above with Sphinx."""
     app.connect("source-read", as_on_github)
+    app.connect("autodoc-process-docstring", norms_as_text)

@@ -155,13 +155,30 @@ def create_atlas(
 
     Nothing is left if no surface can be used.
 
-    path : folder of the atlas
-    template : None for the built-in liver with ``options.template_vertices``
-    solve_response : computes the Response of each registration; must be picklable
-    progress : called with (surfaces done, number of surfaces, name) after each surface
+    Parameters
+    ----------
+    path : str or Path
+        Folder of the atlas.
+    sources : sequence of SurfaceMesh or SurfaceFile
+        Surfaces of the organs.
+    options : AtlasOptions or None
+        Sizes of template and grid.
+    template : Template or None
+        None takes the built-in liver with ``options.template_vertices``.
+    workers : Workers or None
+        Where anatomies are built.
+    solve_response : callable or None
+        Solver of each registration's Response, e.g. ``ResponseSolver()``; picklable. None stores
+        shapes alone.
+    progress : callable or None
+        Called with (surfaces done, number of surfaces, name) after each surface.
 
-    Raises AtlasError if the folder holds something else or another build is at work on it,
-    StorageError if it cannot be written.
+    Raises
+    ------
+    AtlasError
+        If the folder holds something else, or another build is at work on it.
+    StorageError
+        If it cannot be written.
     """
     folder, options = Path(path), options or AtlasOptions()
     with _folder_of(folder):

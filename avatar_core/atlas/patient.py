@@ -66,17 +66,37 @@ _FAR_HULL = 0.5  # hull distance over the mean distance to the neighbours, above
 class PatientOptions:
     """Settings of a patient's vademecum.
 
-    n_vertices : approximate number, of the patient's own mesh
-    weighting, n_neighbors : see `patient_weights`
-    tolerance : target of ``reduced`` for the mean relative L2 error of displacement
-    max_modes : modes of the vademecum at a place; see :class:`BuildRule`
-    n_certified : unseen loads of the certificate; None for 24, or 200 with ``solved``; 0 for none
-    leave_out : numbers of anatomies that get no weight, such as other scans of the patient
-    groups : points that are clamped, accessible or held, in place of the template's; see
-        :func:`avatar_core.atlas.patient_problem.patient_problem`
-    supports : springs of fixed stiffness that hold the organ instead of the clamp
-    inside : what lies inside the organ and is displayed with it, as tumours; as stiff as the organ
-    n_displayed : vertices of the surface that is displayed, about; 0 for that of the mesh
+    Parameters
+    ----------
+    n_vertices : int
+        Number of vertices of the patient's own mesh, about.
+    weighting : str
+        Weights of the known anatomies: "kriging", "lle-template", "lle-grid" or "lle-paper".
+    n_neighbors : int or None
+        Number of anatomies that get weight. None takes that of the weighting.
+    tolerance : float
+        Mean relative L2 error of the displacement that ``reduced`` aims at.
+    max_modes : int
+        Largest number of modes of the vademecum at a place; see :class:`BuildRule`.
+    n_certified : int or None
+        Number of unseen loads of the certificate. None takes 24, or 200 with ``solved``; 0 makes
+        no certificate.
+    leave_out : tuple of int
+        Numbers of anatomies that get no weight, such as other scans of the patient.
+    groups : mapping of ndarray or None
+        Points that are clamped, accessible or held, instead of the template's; see
+        :func:`avatar_core.atlas.patient_problem.patient_problem`.
+    supports : tuple of SupportOption
+        Springs of fixed stiffness that hold the organ instead of the clamp.
+    inside : tuple of SurfaceMesh
+        Surfaces inside the organ that are displayed with it, such as tumours. They are as stiff as
+        the organ.
+    n_displayed : int
+        Number of vertices of the displayed surface, about. 0 takes that of the mesh.
+    build : BuildRule
+        Tolerance and numbers of modes of the vademecum.
+    reduction : ReductionRule
+        Enrichment of ``reduced``.
     """
 
     n_vertices: int = 2850
@@ -128,16 +148,27 @@ class StageSeconds:
 class Patient:
     """A patient's vademecum and how it was made.
 
+    Attributes
+    ----------
     vademecum : Vademecum
-    fidelity : "interpolated", "reduced" or "solved"
-    neighbours : names, nearest first; weights : ndarray, shape (n,)
-    barycenter : Barycenter, with sum |w| and hull distance
-    estimates : GalerkinErrorEstimate after each enrichment (``reduced`` only); the last one is that
-        of the result
-    solutions : number of full finite element solutions
-    notices : what is doubtful of the organ, what did not converge, and where the patient lies in
-        the base, one line each
+        Vademecum of the patient.
+    fidelity : str
+        "interpolated", "reduced" or "solved".
+    neighbours : tuple of str
+        Names of the anatomies that were used, nearest first.
+    weights : ndarray, shape (n,)
+        Their weights.
+    barycenter : Barycenter
+        Weights with their sum of absolute values and the distance from the hull.
+    estimates : tuple of GalerkinErrorEstimate
+        Error estimate after each enrichment of ``reduced``. The last is that of the result.
+    solutions : int
+        Number of full finite element solutions.
+    notices : tuple of str
+        Doubts about the organ, stages that did not converge, and the patient's place in the base,
+        one line each.
     seconds : StageSeconds
+        CPU time of each stage.
     """
 
     vademecum: Vademecum

@@ -61,9 +61,14 @@ def compiled_for(kernel: Any, *types: Any) -> Any:
 class ContactModel:
     """The constant part of a contact simulation: an organ, its tools and effects.
 
-    arrays : tuple of :data:`avatar_core.contact.layout.MODEL`, which nobody may change
-    table : where they lie, for compiled code
-    compiled : the step, the same for all models
+    Attributes
+    ----------
+    arrays : tuple
+        Constants, named by :data:`avatar_core.contact.layout.MODEL`. Nobody may change them.
+    table : ndarray
+        Where they lie, for compiled code.
+    compiled : callable
+        The step, the same for all models.
     """
 
     def __init__(self, arrays: Any) -> None:
@@ -92,11 +97,20 @@ class ContactModel:
 class ContactData:
     """State of one loop between the steps of a model, and the result of the last.
 
-    model : the ContactModel
-    state : tuple of :data:`avatar_core.contact.data.DATA`, with one for each effect
-    out : its :data:`avatar_core.contact.data.OUT`: forces, contacts, cloud
-    table : where these arrays lie, for compiled code
-    turns : whether it matters that a tool turns
+    Attributes
+    ----------
+    model : ContactModel
+        Constants.
+    state : tuple
+        Arrays that the step keeps, named by :data:`avatar_core.contact.data.DATA`, and one more
+        for each effect.
+    out
+        Results of the last step, named by :data:`avatar_core.contact.data.OUT`: forces, contacts,
+        cloud.
+    table : ndarray
+        Where these arrays lie, for compiled code.
+    turns : bool
+        Whether it matters that a tool turns.
     """
 
     def __init__(self, model: ContactModel) -> None:

@@ -54,9 +54,9 @@ class Material:
     Attributes
     ----------
     young_modulus : float
-        E > 0 [Pa].
+        Young's modulus E > 0 [Pa].
     poisson_ratio : float
-        0 <= nu < 0.5.
+        Poisson's ratio, 0 <= nu < 0.5.
     """
 
     young_modulus: float = 0.17e6

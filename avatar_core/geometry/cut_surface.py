@@ -37,11 +37,17 @@ Triple = tuple[float, float, float]
 class CutSurface:
     """A surface that divides space, and how a cut along it opens.
 
-    open_along : direction in which the cut opens
-    point, normal : of a plane [m]
-    bezier : 16 control points, row by row [m], instead of a plane; it goes on straight beyond its
-        edges
-    part : of the cut's area that opens at most
+    Parameters
+    ----------
+    open_along : tuple of float
+        Direction in which the cut opens.
+    point, normal : tuple of float or None
+        A point of a plane [m], and its normal.
+    bezier : tuple or None
+        Bezier surface instead of a plane: 16 control points, row by row [m]. It goes on straight
+        beyond its edges.
+    part : float
+        Largest part of the cut's area that opens.
 
     Raises
     ------

@@ -162,7 +162,16 @@ def distance_grid(
 ) -> DistanceGrid:
     """Return signed distances on a grid that reaches padding [m] beyond the surface on every side.
 
-    band : see `distance_in_box`
+    Parameters
+    ----------
+    surface : SurfaceMesh
+        Organ.
+    spacing : float
+        Distance of neighbouring grid points [m].
+    padding : float
+        Distance from the organ to the sides of the grid [m].
+    band : float or None
+        Distances are cut to [-band, band]; see `distance_in_box`.
     """
     return distance_in_box(surface, padded_box([surface], spacing, padding), band)
 

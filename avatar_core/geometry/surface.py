@@ -152,18 +152,31 @@ def read_surface(
 
     :mod:`avatar_core.geometry.surface_formats` lists the formats.
 
-    unit : "m", "cm" or "mm", of the file's coordinates
-    axes : where the file's +x, +y, +z point ("RAS", "LPS", "RIA", ...), or a rigid (4, 4) matrix
-        from the file's coordinates to RAS in the file's unit; None: as the file's header states
-        (``SPACE=LPS``, as 3D Slicer writes it), RAS if it states none. Axes that are given hold
-        against the header, with a notice.
-    label : number, or name in a ``.seg.nrrd``, of one in a label map, or several with commas
-        between; not needed for the only one
-    inside : further labels inside the organ, as tumours; those cut out of its label are filled
-    one_body : small stray bodies are dropped, others refused; False for tumours
+    Parameters
+    ----------
+    path : path-like
+        File.
+    unit : str
+        Unit of the file's coordinates: "m", "cm" or "mm".
+    axes : str, array_like or None
+        Directions of the file's +x, +y, +z ("RAS", "LPS", "RIA", ...), or a rigid (4, 4) matrix
+        from the file's coordinates to RAS in the file's unit. None takes them from the header
+        (``SPACE=LPS``, as 3D Slicer writes it), or RAS without one. Axes that are given override
+        the header, with a notice.
+    label : int or str or None
+        Label of a label map: its number, its name in a ``.seg.nrrd``, or several with commas. None
+        takes the only one.
+    inside : sequence of str
+        Further labels inside the organ, such as tumours. If they were cut out of its label, they
+        are filled.
+    one_body : bool
+        Drop small stray bodies and refuse others. False for tumours.
 
-    Raises SurfaceError naming cause and remedy: file missing or unreadable, no triangles, points
-    not finite, surface open, more than one organ, implausible size.
+    Raises
+    ------
+    SurfaceError
+        If the file is missing or unreadable, has no triangles, points that are not finite, an open
+        surface or more than one organ, or if the size is implausible.
     """
     path = Path(path)
     scale = _metres_per(unit)

@@ -54,7 +54,7 @@ class Tip:
     Attributes
     ----------
     grasp : Jaw or None
-        Jaws that close at the lowest point of the tip; None for a tool that only pushes.
+        Jaws that close at the lowest point of the tip. None for a tool that only pushes.
 
     Raises
     ------

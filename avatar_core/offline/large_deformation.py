@@ -51,12 +51,20 @@ _SIGNS = np.stack([np.ones(_ORDER), (-1.0) ** np.arange(1, _ORDER + 1)])
 class LargeRule:
     """How far and how well.
 
-    max_push : depth aimed at [m]
-    tolerance : of displacement (relative L2) and depth at the reach
-    least_det : smallest det F at the reach, so that no element is inside out
-    least_stiffness : smallest d(force)/d(depth), over that at rest
-    max_modes : of a region at most; ``mode_tolerance``, mean relative L2 of what they leave of the
-        displacement at the reach
+    Parameters
+    ----------
+    max_push : float
+        Depth aimed at [m].
+    tolerance : float
+        Relative error of displacement (L2) and depth at the reach.
+    least_det : float
+        Smallest det F at the reach, so that no element is inside out.
+    least_stiffness : float
+        Smallest d(force)/d(depth), over that at rest.
+    max_modes : int
+        Largest number of modes of a region.
+    mode_tolerance : float
+        Mean relative L2 error of the displacement that these modes leave at the reach.
     """
 
     max_push: float = 20e-3

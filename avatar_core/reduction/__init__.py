@@ -1,5 +1,7 @@
 """Model order reduction: responses to many loads in few modes.
 
+::
+
     problem = mor.LoadProblem(K, F)                       # K u(s) = f(s), sparse or an Elasticity
     pgd = mor.solve_pgd(problem, mor.PGDRule(max_modes=20, tolerance=1e-3))
     best = mor.pod(snapshots, 20)                         # the rival, of all solutions

@@ -1,5 +1,7 @@
 """Comparison of anatomies: level sets, registration to a template, LLE, kriging.
 
+::
+
     lle = shapes.LLE(n_neighbors=10, n_components=2)      # paper, Eq. 15 and 16
     coordinates = lle.fit_transform(vectors)              # one shape a row
     weights = shapes.kriging(vectors, new, n_neighbors=64)

@@ -1,5 +1,7 @@
 """Answers of a vademecum when its data are known as distributions only.
 
+::
+
     known = {"young": uncertainty.Lognormal(5.3e3, 1.33)}
     bands = uncertainty.force_bands(vademecum, known, points, depths)
 

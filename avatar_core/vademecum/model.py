@@ -146,24 +146,35 @@ SCHEMA_VERSION = "6.2"
 class Vademecum:
     """An organ's precomputed mechanical response.
 
-    far : SeparatedField, the global modes: space (3 n_vertices, rank) [m], load (3 n_positions,
-        rank)
-    blocks : Blocks of the mesh's vertices; field : BlockField over them, the displacement under
-        unit forces in x, y, z at each load position [m/N]
-    trailing : ndarray, shape (3 n_positions, n), load functions of further modes, of which the
-        contact compliance alone makes use
-    contact_near : LocalBlocks, tapered remainder of the contact compliance at load positions,
-        symmetric [m/N]
-    tip_field : TipField, smooth distance, shape and access that a tool tip feels
-    parametric : ParametricResponse or None, the coordinates of the material: all fields above
-        are those of one choice of their values (:meth:`at`)
-    contrast : Young's modulus inside the tumour over that outside; None without a tumour
-    supports : springs that hold the organ, beside the clamp of ``regions``
-    resection : how far the cut of the mesh is opened; None without a cut
-    large : LargeDeformation or None, the load's magnitude as a coordinate
-    body : BodyResponse or None, mass and weight as the far modes see them
-    display : Display or None, a finer surface, and structures inside; None for the boundary of the
-        mesh alone
+    Attributes
+    ----------
+    far : SeparatedField
+        Global modes: space (3 n_vertices, rank) [m], load (3 n_positions, rank).
+    blocks : Blocks
+        Blocks of the mesh's vertices.
+    field : BlockField
+        Displacement over these blocks under unit forces in x, y, z at each load position [m/N].
+    trailing : ndarray, shape (3 n_positions, n)
+        Load functions of further modes. The contact compliance alone uses them.
+    contact_near : LocalBlocks
+        Tapered remainder of the contact compliance at load positions, symmetric [m/N].
+    tip_field : TipField
+        Smooth distance, shape and access of the surface under a tip.
+    parametric : ParametricResponse or None
+        Coordinates of the material. All fields above hold at one choice of their values
+        (:meth:`at`).
+    contrast : float or None
+        Young's modulus inside the tumour over that outside; None without a tumour.
+    supports : tuple of Support
+        Springs that hold the organ beside the clamp of ``regions``.
+    resection : Resection or None
+        State of the cut: how far it is opened. None without a cut.
+    large : LargeDeformation or None
+        Response to large pushes, with the load's magnitude as a coordinate.
+    body : BodyResponse or None
+        Mass and weight in the global modes.
+    display : Display or None
+        Finer surface, and structures inside. None for the boundary of the mesh alone.
     """
 
     name: str

@@ -8,10 +8,12 @@ import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import typer
 
+import avatar_core as av
 from avatar_core.cli.main import app
 from tests.helpers.paths import ROOT
 
@@ -79,6 +81,12 @@ def test_the_pages_become_html_without_a_warning(tmp_path: Path) -> None:
     for page in PAGES:
         html = page.relative_to(DOCS).with_suffix(".html").as_posix()
         assert (tmp_path / html).exists() and f'href="{html}"' in first, html
+    api = (tmp_path / "interfaces" / "python.html").read_text()
+    for package in (av, av.mor, av.shapes, av.effects, av.uncertainty):
+        for name in package.__all__:
+            found = getattr(package, name)
+            if not isinstance(found, ModuleType):
+                assert f'id="{package.__name__}.{name}"' in api, name
 
 
 def command_lines(page: Path) -> list[str]:

@@ -19,6 +19,7 @@ from avatar_core.contact.effects.tilt import Tilt
 from avatar_core.contact.effects.tumour import Tumour
 from avatar_core.contact.effects.viscoelasticity import Viscoelasticity
 
+#: Class of each effect, by its name.
 EFFECTS: dict[str, type[Effect]] = {
     effect.name: effect
     for effect in (
