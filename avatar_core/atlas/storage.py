@@ -44,8 +44,8 @@ from avatar_core.shapes.registration import (
 
 ATLAS_SCHEMA = "2.0"
 MAX_FILE_BYTES = 1 << 30
-MAX_POINTS = 10_000_000  # of the box; an atlas has 50,000
-MOST_STEPS = 1000  # of a registration, in each of its loops
+MAX_POINTS = 10_000_000  # points of the box; an atlas has 50,000
+MOST_STEPS = 1000  # steps of a registration, in each of its loops
 FRAME, SHAPE, LEVEL_SET, RESPONSE = "frame.h5", "shape.h5", "level_set.h5", "response.h5"
 
 Arrays = dict[str, np.ndarray]

@@ -190,7 +190,7 @@ class _Topics:
         kind, take = self._readers[connection.topic]
         message = self._read(content, kind)
         if message is None and kind == types.STATE:
-            message = self._read(content + b"\0", kind)  # of before its last field, ``held``
+            message = self._read(content + b"\0", kind)  # older, without its last field, ``held``
         if message is None or not 0 <= received < 1 << 63:
             self._failed[connection.topic] = self._failed.get(connection.topic, 0) + 1
         else:

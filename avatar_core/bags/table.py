@@ -16,7 +16,7 @@ from avatar_core.errors import StorageError
 
 _BACK = 50_000_000  # from a message to the next: more than recorders mix up [ns]
 _FEW = 3  # times that a clock is set back; more often, messages were written in any order
-MAX_MESSAGES = 10_000_000  # of a topic: nearly three hours at 1 kHz, 700 MB
+MAX_MESSAGES = 10_000_000  # messages of a topic: nearly three hours at 1 kHz, 700 MB
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from avatar_core.uncertainty.sensor import sensed
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import load_vademecum
 
-RADIUS = 5e-3  # of a tip of which no radius is given [m]
+RADIUS = 5e-3  # radius of a tip without a given one [m]
 SENSOR = {f"{prefix}measured_cf": axes for prefix, axes in (("", "absolute"), ("body/", "body"))}
 _NEXT = 0.05  # from a pose to the wrenches before and after it, at most [s]
 _DIFFER = 0.9  # part of the stamps that are others than those before them, at least
@@ -167,7 +167,7 @@ def palpated(
     """
     found = sensed(organ, touched.tip, touched.time, touched.position, touched.vector)
     palpation = palpation_of(touched.position, found.size)
-    errors = replace(errors, mesh=math.hypot(errors.mesh, found.lost / 2.0))  # of all alike
+    errors = replace(errors, mesh=math.hypot(errors.mesh, found.lost / 2.0))  # common to all forces
     return palpation, errors, (*touched.notes, *found.notices)
 
 

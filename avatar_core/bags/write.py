@@ -21,7 +21,7 @@ from avatar_core.errors import StorageError
 from avatar_core.scene.recording import Recording
 from avatar_core.scene.replay import scene_of
 
-_METADATA_VERSION = 9  # of rosbag2 in Jazzy
+_METADATA_VERSION = 9  # version of rosbag2 in Jazzy
 
 
 def write_mcap(recording: Recording, path: str | Path) -> None:

@@ -28,8 +28,8 @@ COMBINATIONS = ("oblique", "two tools", "gravity")
 DEPTH_FRACTIONS = (0.25, 0.5, 0.75)  # of the depth aimed at: 5, 10 and 15 mm of 20
 OBLIQUE = np.radians(30.0)
 APART = 40e-3  # [m]
-DENSITY, GRAVITY = 1060.0, 9.81  # of liver [kg/m^3], [m/s^2]
-_MAX_ITERATIONS = 30  # of Newton's method
+DENSITY, GRAVITY = 1060.0, 9.81  # density of liver [kg/m^3], gravity [m/s^2]
+_MAX_ITERATIONS = 30  # iterations of Newton's method
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ THIN = 25e-3  # thickness of an organ at its edges [m]
 TINY = 1e-12  # [N]
 _MANY_DRAWN = 400  # places among which the thinnest ones are found
 _SKIN = 1e-4  # below a surface, from where the other side is looked for [m]
-LEAST_FACTOR = 0.5  # of the law's error: a few places by luck all well met prove no more
+LEAST_FACTOR = 0.5  # factor on the law's error: a few lucky places prove no more
 
 
 @dataclass(frozen=True, eq=False)

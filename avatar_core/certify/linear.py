@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
 
 _BATCH = 40  # load positions solved at once
-_TRIED = 2  # of them in single precision first
+_TRIED = 2  # loads first tried in single precision
 
 
 def certify(

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
     from avatar_core.vademecum.tip_field import TipField
 
-HEIGHTS = (0.0, 10e-3)  # of the centre of a ball above the surface, of up to 10 mm [m]
+HEIGHTS = (0.0, 10e-3)  # heights of a ball's centre above the surface, up to 10 mm [m]
 _OPEN = 0.999  # access from which a tip may touch without the force fading
 _WAY = np.linspace(2e-3, 14e-3, 8)  # heights above a tip along its approach [m]
 _BATCH = 40  # patches solved at once

@@ -26,7 +26,7 @@ _LARGE = {
     "push": 0.5,
     "time": 0.05,
 }
-_PER_SITE = 0.4  # of a place of contacts, over all else
+_PER_SITE = 0.4  # time of a place of contacts, over all else
 
 
 @contextmanager

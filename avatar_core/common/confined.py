@@ -79,7 +79,7 @@ class Confined:
         self._lock = threading.Lock()
         self._child = Child(
             "avatar_core.common.confined",
-            str(max_bytes),  # of which each thread would take some
+            str(max_bytes),  # each thread would take some of it
             stdout=subprocess.DEVNULL,  # libraries print there; the error that is raised counts
             stderr=subprocess.DEVNULL,
         )

@@ -18,15 +18,15 @@ from avatar_core.errors import StorageError
 
 Kind = TypeVar("Kind")
 
-MAX_LETTERS = 4 << 20  # of JSON; the curve of a large vademecum has 50,000
-MAX_NAME = 200  # of a name, in letters
+MAX_LETTERS = 4 << 20  # letters of JSON; the curve of a large vademecum has 50,000
+MAX_NAME = 200  # letters of a name
 
 
 def plain(value: Any) -> Any:
     """Convert a value for JSON: arrays become lists, numbers plain, and non-finite numbers null."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
-    if hasattr(value, "tolist"):  # of numpy
+    if hasattr(value, "tolist"):  # an array or number of numpy
         value = value.tolist()
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]

@@ -27,7 +27,7 @@ Attributes = dict[str, str]
 UNREADABLE = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, ArithmeticError)
 
 
-MAX_EXPANSION = 8  # of compressed arrays over the file, so that a small file cannot fill the memory
+MAX_EXPANSION = 8  # arrays over file size, so that a small file cannot fill the memory
 _PACKED_FROM = 1 << 16  # bytes of an array from which it is compressed, without loss
 _PACKING = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 

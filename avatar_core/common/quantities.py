@@ -12,7 +12,7 @@ from typing import Any, get_type_hints
 
 from avatar_core.errors import SceneError
 
-MAX_LETTERS = 300  # of a name or a text
+MAX_LETTERS = 300  # letters of a name or a text
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from avatar_core.contact.effects.viscoelasticity import least_shown
 from avatar_core.reduction.block_field import BLOCK
 
 ALL = 1 << 30  # a level that no mode has
-LEAST_WEIGHT = 0.02  # of the load positions of a region, below which its modes are left out
+LEAST_WEIGHT = 0.02  # weight of a region's load positions below which its modes are left out
 MAX_PAST = 4  # regions whose history of loads is shown
 
 
@@ -166,7 +166,7 @@ def _fade_regions(model, data):  # type: ignore[no-untyped-def]
         r = data.touched[i]
         norm[r] = 0.0
         for k in range(model.region_start[r] + n_global, model.region_start[r + 1]):
-            norm[r] += np.float64(data.amplitude[k]) ** 2  # of modes with a peak of 1
+            norm[r] += np.float64(data.amplitude[k]) ** 2  # modes have a peak of 1
         norm[r] = np.sqrt(norm[r])
     bound = np.inf  # in the end the norm of the region after the last that is kept
     for _ in range(MAX_PAST + 1):

@@ -18,10 +18,10 @@ from avatar_core.tips.law import LAW_STATE
 # The result of a step, of T tools; of the n_contacts active ones, the contact_* hold the first.
 OUT = kind(
     "Out",
-    force=array("T 3"),  # of the organ on each tool [N],
-    torque=array("T 3"),  # and about its pose [N m]: of friction, and of a punch that leans
-    force_error=array("T"),  # that one contact in ten exceeds [N], by `estimate_error`
-    status=array("T", np.int64),  # of each tool
+    force=array("T 3"),  # force of the organ on each tool [N],
+    torque=array("T 3"),  # torque about its pose [N m]: of friction, and of a punch that leans
+    force_error=array("T"),  # error that one contact in ten exceeds [N], by `estimate_error`
+    status=array("T", np.int64),  # status of each tool
     cloud=array("V 6", np.float32),  # deformed position and displacement [m]
     n_contacts=array("1", np.int64),
     contact_tool=array("T", np.int64),
@@ -36,7 +36,7 @@ DATA = kind(
     "Data",
     # inputs of a step
     tip=array("T 3"),  # sphere centres [m]
-    orientation=array("T 4"),  # of the tools, x y z w; zero if it is not known
+    orientation=array("T 4"),  # quaternions of the tools, x y z w; zero if unknown
     jaw=array("T", np.bool_),  # whether the jaw of a tool is closed
     shown=array("1", np.int64),  # level of the modes that are shown
     # state between steps
@@ -55,7 +55,7 @@ DATA = kind(
     access=array("T"),  # chi
     access_slope=array("T 3"),
     point=array("T 3"),  # s [m]
-    local=array("P", np.int64, -1),  # of gather, all -1
+    local=array("P", np.int64, -1),  # scratch of gather, all -1
     nodes=array(f"T {_S}", np.int64),  # load positions that carry the tip
     n_nodes=array("T", np.int64),
     weight=array(f"T {_S} 4"),  # w and its gradient
@@ -65,7 +65,9 @@ DATA = kind(
     self_slope=array("T 3"),  # grad gamma
     blurred=array("T"),  # gamma - f . C f [m/N]
     compliance=array("T T"),
-    amplitude=array("amplitudes", np.float32),  # of global modes that stand apart, of all regions
+    amplitude=array(
+        "amplitudes", np.float32
+    ),  # amplitudes of separate global modes, then of regions
     touched=array("regions", np.int64),  # the regions whose modes move the cloud,
     n_touched=array("1", np.int64),  # their number,
     is_touched=array("regions", np.bool_),  # and whether a region is one

@@ -29,8 +29,8 @@ DISPLAY = kind(
     "Display",
     corner=array("v 4", np.int32),  # points of the mesh that carry each displayed vertex
     weight=array("v 4", np.float32),
-    rest=array("p 3", np.float32),  # of the mesh's points, at rest [m]
-    start=array("q", np.int64),  # of the mesh's points around each load position, in
+    rest=array("p 3", np.float32),  # the mesh's points at rest [m]
+    start=array("q", np.int64),  # first of the mesh's points around each load position, in
     around=array("a", np.int32),  # points that a tip near the load position may move
 )
 

@@ -12,7 +12,7 @@ from avatar_core.contact.organ_response import make_tip_response, tip_carriers
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.tip_field import TipField
 
-_OFF = 5e-3  # of the accessible surface, up to which a point belongs to it [m]
+_OFF = 5e-3  # largest distance of a point from the accessible surface [m]
 _SHELL = 5e-3  # below and above the surface, in which the compliance is sampled [m]
 
 

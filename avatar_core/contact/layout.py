@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
 
 LANES = 32  # float32 numbers that a vectorised loop processes at once
-PERIOD = 1e-3  # of the steps [s]
+PERIOD = 1e-3  # period of the steps [s]
 
 # T tools, P load positions, K modes of contact, m of the cloud; on the grid of the tip field x y z.
 MODEL = kind(
@@ -74,13 +74,13 @@ MODEL = kind(
     level=array("k", np.int32),
     block_start=array("parts blocks", np.int64),
     shown=array("1", np.int64),  # the level that is shown
-    place=array("v", np.int32),  # of each point in the blocks
+    place=array("v", np.int32),  # place of each point in the blocks
     # regions of load positions, whose amplitudes begin at region_start
     region=array("P", np.int32),
     region_start=array("r", np.int64),
     regional_load=array("P 3 m", np.float32),
     rest=array("V 6", np.float32),  # the cloud without displacement [m]
-    tip_offset=array("T"),  # of a pose above the lowest point of the tip [m]
+    tip_offset=array("T"),  # height of a pose above the lowest point of the tip [m]
     # None where the load is the vademecum's own patch; and where the mesh's vertices are shown
     law=LAW,
     dent=DENT,

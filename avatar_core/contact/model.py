@@ -1,7 +1,7 @@
 """Contact between tool tips and an organ at 1 kHz: a model, its data, and the step.
 
     model = model_of(vademecum, tips)       # constant; seconds, may fail
-    data = model.data()                     # what one loop keeps and writes
+    data = model.data()                     # state and results of one loop
     status = step(model, data, positions)   # 1 kHz; never fails: see data.out
 
 A model can serve several loops at once, each with data of its own. The compiled code is in

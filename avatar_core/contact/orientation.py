@@ -12,7 +12,7 @@ from typing import Any
 
 from avatar_core.common.jit import inlined
 
-_KNOWN = 0.5  # of a quaternion's square, 1 if there is an orientation
+_KNOWN = 0.5  # least square of a quaternion, 1 if there is an orientation
 
 
 def composed(frame: Any, orientation: Any) -> tuple[Any, Any, Any, Any]:

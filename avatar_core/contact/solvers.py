@@ -20,9 +20,9 @@ MAX_SWEEPS = 1000
 PATIENCE = 8  # sweeps before the active-set solution is tried,
 MAX_EXACT = 64  # and after which it is no longer tried
 GAP_TOLERANCE = 1e-9  # [m] of gap change that ends Gauss-Seidel
-MAX_EXCHANGES = 4  # of the active set, for each tool
+MAX_EXCHANGES = 4  # exchanges of the active set, for each tool
 INSIDE = 1e-9  # [m] of penetration that makes a tip active
-LEAST_PIVOT = 1e-8  # of a tip's own compliance
+LEAST_PIVOT = 1e-8  # fraction of a tip's own compliance
 
 
 @inlined

@@ -48,11 +48,11 @@ SUPERPOSITION = kind(
     total=array("K"),  # modes at the end of the period
     near_gain=array("1", start=1.0),  # gain of the near field
     free_normal=array("T"),  # its component along n [m]
-    free_displacement=array("T 3"),  # of the patch without any load [m]
+    free_displacement=array("T 3"),  # displacement of the patch without any load [m]
     near_free=array("T S 3"),  # near displacement at the nodes by the load history
     unit_displacement=array("S 3"),  # at the nodes by a unit normal force, at rest
     displacement=array("S 3"),  # at the nodes by all causes
-    hessian=array("3 3"),  # of phi
+    hessian=array("3 3"),  # second derivatives of phi
     normal_gradient=array("3 3"),  # dn_i / dp_d
 )
 

@@ -18,7 +18,7 @@ from avatar_core.tips.law import LEAST_CONTACT, dent, stored_energy
 from avatar_core.tips.profile import STIFFNESS, TAKEN
 
 MOST_TAKEN = 0.9  # part of a dent's least compliance, 1 / (2 E* radius), that may be taken off
-MAX_STEPS = 60  # of Newton's method, with bisection where it leaves its bracket
+MAX_STEPS = 60  # steps of Newton's method, with bisection where it leaves its bracket
 TOLERANCE = 1e-13  # [m] of depth, or relative of the force
 
 

@@ -20,7 +20,7 @@ from avatar_core.fem.hyperelastic_materials import HyperelasticMaterial, determi
 
 # The entries of F that axial symmetry leaves: (r, r), (r, z), (z, r), (z, z), (theta, theta)
 _ROW, _COLUMN = np.array([0, 0, 2, 2, 1]), np.array([0, 2, 0, 2, 1])
-_DEGREE = 5  # of the quadrature, 3 x 3 points
+_DEGREE = 5  # degree of the quadrature, 3 x 3 points
 
 
 class AxisymmetricBody:

@@ -25,8 +25,8 @@ from avatar_core.common.jit import compiled
 
 RINGS, SECTORS = 8, 8
 ITERATIONS = 25  # at most, until a step moves less than
-SETTLED = np.float32(3e-4)  # of the solution: loads are then within 0.1 %
-_PARTS, _ORDER = 4, 6  # of a sector that is close, in both directions, and of its quadrature
+SETTLED = np.float32(3e-4)  # tolerance of the solution: loads are then within 0.1 %
+_PARTS, _ORDER = 4, 6  # parts of a close sector in both directions, and order of its quadrature
 _RAYS = 720  # from the middle of a sector over itself
 _HALVINGS = 50  # to find where a ray leaves the sector
 

@@ -31,7 +31,7 @@ from avatar_core.fem.hyperelasticity import Hyperelasticity
 
 _DESCENT = 1e-4  # Armijo's fraction of the decrease that the slope promises
 _NOISE = 1e-15  # rounding of the energy, over Young's modulus times the volume
-_HALVINGS = 8  # of a Newton step, before the state counts as lost
+_HALVINGS = 8  # halvings of a Newton step, before the state counts as lost
 _QUICK = 5  # Newton iterations up to which the next load step doubles
 _MOST_INNER = 200  # conjugate gradient iterations of one system
 _STALE = 25  # conjugate gradient iterations of one system that make a new factor pay

@@ -30,7 +30,7 @@ from avatar_core.fem.triangles import subdivided_rule, triangle_shape
 from avatar_core.geometry.mesh import Regions, TetMesh
 
 LEAST_PATCH_RADIUS = 12e-3  # [m]
-FARTHEST = 5e-3  # of a point from the accessible surface, to which it is then moved [m]
+FARTHEST = 5e-3  # largest distance of a point from the accessible surface [m]
 LEAST_OPENNESS = 0.2  # length of the mean unit normal within R, below which a face carries no load
 # Mean edge, in patch radii, from which edges get a midpoint. Linear interpolation between corners
 # misses 9 % of the contact compliance at 0.6 (a small liver, Amos-052), and grows with its square.

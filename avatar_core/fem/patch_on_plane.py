@@ -31,10 +31,10 @@ from avatar_core.common.jit import compiled, fast
 
 PATCH = 0.7665  # P(0)
 FAR = 3.0  # patch radii, beyond which P follows from two point loads and their widths
-_INTERVALS = 96  # of the table of P
+_INTERVALS = 96  # intervals of the table of P
 _WIDTHS = 0.125  # P = (1 + 1 / (8 y^2)) / (pi y) far off, the mean of r^2 / R_p^2 being 1 / 4
 _FINE = 24  # nodes of the rule for the dent of one patch
-_LAST, _NODES = 60.0, 1200  # of the integral over x: [48 J_3 / x^3]^2 falls as x^-7
+_LAST, _NODES = 60.0, 1200  # limit and nodes of the integral over x: [48 J_3 / x^3]^2 falls as x^-7
 
 
 def patch_dent(rho: np.ndarray) -> np.ndarray:

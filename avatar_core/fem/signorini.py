@@ -36,10 +36,10 @@ from avatar_core.geometry.tip import Tip
 
 REACH = 1.4  # radius of the candidate surface over the contact radius on a half-space
 _FACING = 0.2  # least cosine of a face's normal to the axis
-_PIECES = 4  # of a face's edge, for the quadrature: the rim cuts faces
-_LEAST_AREA = 0.02  # of a hat within the rim, over the mean one
+_PIECES = 4  # pieces of a face's edge, for the quadrature: the rim cuts faces
+_LEAST_AREA = 0.02  # area of a hat within the rim, over the mean area
 _BATCH = 64  # columns solved at once
-_MOST_CHANGES = 60  # of the active set
+_MOST_CHANGES = 60  # changes of the active set
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,13 +31,13 @@ from avatar_core.fem.hyperelastic_materials import (
 )
 
 _FINE = 1.2  # radius and depth of the part with elements of one size [R]
-_GROWTH = 0.25  # of the elements beyond it: their size over the distance from it
-_STEP, _LEAST_STEP = 0.1, 0.01  # of the depth [R]
+_GROWTH = 0.25  # growth of elements beyond it: their size over the distance from it
+_STEP, _LEAST_STEP = 0.1, 0.01  # steps of the depth [R]
 _MAX_ITERATIONS = 25
 _MAX_HALVINGS = 12
-_ROUNDING = 1e-16  # of the energy, over the volume
+_ROUNDING = 1e-16  # rounding of the energy, over the volume
 _MOST_PRESSURE = 3.0  # in the tangent [E]
-_TOLERANCE = 1e-7  # of the residual, relative to the force
+_TOLERANCE = 1e-7  # tolerance of the residual, relative to the force
 
 
 @dataclass(frozen=True)

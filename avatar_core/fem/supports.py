@@ -29,7 +29,7 @@ from avatar_core.common.supports import LEAST_STIFFNESS, MOST_STIFFNESS
 from avatar_core.errors import MaterialError
 from avatar_core.geometry.mesh import IN_FACE, TetMesh
 
-LEAST_HELD = 1e-6  # of q(r) L / E: below, 1 N moves a liver by metres
+LEAST_HELD = 1e-6  # least q(r) L / E: below, 1 N moves a liver by metres
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,13 +17,13 @@ import numpy as np
 
 from avatar_core.geometry.mesh import POSTERIOR_SUPERIOR, TetMesh, without_islands
 
-CAVA = -0.10  # of the width, from the centroid to the left
+CAVA = -0.10  # fraction of the width, from the centroid to the left
 FALCIFORM = -0.17
-CAVA_HALF_WIDTH = 12e-3  # of the vein, some 25 mm wide [m]
+CAVA_HALF_WIDTH = 12e-3  # half the width of the vein, some 25 mm [m]
 FALCIFORM_HALF_WIDTH = 5e-3  # [m]
-BARE_FRACTION = 0.10  # of the organ's surface
-TIP_FRACTION = 0.10  # of the width, at either end
-LEAST_ISLAND = 0.2  # of an attachment's faces; smaller islands are folds elsewhere
+BARE_FRACTION = 0.10  # fraction of the organ's surface
+TIP_FRACTION = 0.10  # fraction of the width, at either end
+LEAST_ISLAND = 0.2  # fraction of an attachment's faces; smaller islands are folds elsewhere
 
 ANTERIOR_SUPERIOR = np.array([0.0, 1.0, 1.0]) / np.sqrt(2.0)
 POSTERIOR = np.array([0.0, -1.0, 0.0])

@@ -12,11 +12,11 @@ from avatar_core.geometry.label_masks import in_ml
 from avatar_core.geometry.surface import SurfaceMesh, box_points
 
 LIVER_VOLUMES = (700e-6, 3500e-6)  # [m^3]
-_DEPTH = 5e-3  # that is eroded, so that bridges of up to twice that are cut [m]
-_SPACING = 3e-3  # of the grid on which that is done [m]
+_DEPTH = 5e-3  # eroded depth, which cuts bridges of up to twice that [m]
+_SPACING = 3e-3  # spacing of the grid of the erosion [m]
 # Least part of the rest that counts as a body. At most 0.1 % splits off from any of 64 livers.
 _SMALLEST_BODY = 0.02
-_LEAST_INSIDE, _ALL = 0.5, 0.95  # of a lesion
+_LEAST_INSIDE, _ALL = 0.5, 0.95  # fractions of a lesion
 _SAMPLES = 32  # points along each side of a lesion's box
 
 

@@ -23,8 +23,8 @@ _FEW = 4  # points of a group, from which on they cover an area
 _AROUND = 16  # nearest points that are looked at
 _PIECES = 3  # a face is sampled at the centroids of this number squared of triangles
 _HALF_TURN = 1.05 * np.pi  # between two points in sight, above which a place lies beside them
-_REACH = 1.5  # of the nearest point, over the spacing of a group
-_OFF = 0.35  # of points from the surface that they mean, over its mean edge
+_REACH = 1.5  # distance of the nearest point over the spacing of a group
+_OFF = 0.35  # distance of points from their surface over its mean edge
 REGIONS = ("clamped", "accessible")  # groups that are no supports
 
 

@@ -32,7 +32,7 @@ _NRRD_TYPES = {
     "f4": ("float",),
     "f8": ("double",),
 }
-_TO_RAS = {  # of the spaces that NRRD names, in full and in short, the signs of their axes
+_TO_RAS = {  # signs of the axes of NRRD's spaces, in full and in short
     "right-anterior-superior": (1, 1, 1),
     "left-anterior-superior": (-1, 1, 1),
     "left-posterior-superior": (-1, -1, 1),

@@ -35,8 +35,8 @@ LABEL_SPACING = 2.0  # label maps finer than this are averaged to it [mm]
 _FEWEST = 8  # voxels along each side of a label, to which it is averaged at most
 _MAX_LABELS = 100  # more are an image
 _SLIMMEST = 100.0  # a voxel's length over its width
-_VOLUME_ERROR = 2e-3  # of a surface, relative to its voxels
-_MOST_LEVELS = 6  # that are tried for it,
+_VOLUME_ERROR = 2e-3  # volume error of a surface, relative to its voxels
+_MOST_LEVELS = 6  # levels that are tried for it,
 _LEVELS = (0.1, 0.9)  # between these
 
 
@@ -77,7 +77,7 @@ def surface_of_label(
     chosen = [_chosen(segments, path.name, one) for one in (label, *inside)]
     box = around([_box_of(found, path.name, one) for some in chosen for one in some])
     organ, *parts = (np.pad(_mask_in(box, found, some), 1) for some in chosen)
-    ml = 1e-3 * abs(float(np.linalg.det(affine[:3, :3])))  # of a voxel
+    ml = 1e-3 * abs(float(np.linalg.det(affine[:3, :3])))  # volume of a voxel
     lines = [_read(chosen[0], organ, ml)]
     for one, part in zip(chosen[1:], parts, strict=True):
         organ, share = filled(organ, part)
@@ -237,7 +237,7 @@ def _at_volume(values: FloatArray, wanted: float) -> Soup:
         volumes.append(signed_volume(vertices, faces))
         if abs(volumes[-1] - wanted) < _VOLUME_ERROR * wanted:
             break
-        slope = -wanted / 0.5  # of a mask so small that the blur leaves a cone
+        slope = -wanted / 0.5  # slope for a mask so small that the blur leaves a cone
         if len(volumes) > 1 and volumes[-1] != volumes[-2]:
             slope = (volumes[-1] - volumes[-2]) / (levels[-1] - levels[-2])
         levels.append(float(np.clip(levels[-1] + (wanted - volumes[-1]) / slope, *_LEVELS)))

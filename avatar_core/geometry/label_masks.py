@@ -16,7 +16,7 @@ from avatar_core.common.arrays import FloatArray, IntArray
 Mask = NDArray[np.bool_]
 Box = tuple[slice, slice, slice]
 
-_ENCLOSED = 0.5  # of the surface of a part, from which on the organ encloses it
+_ENCLOSED = 0.5  # touched fraction of a part's surface above which the organ encloses it
 _CAVITY = 1.0  # smallest cavity in a notice [ml]
 # DICOM leaves out empty slices, so a cropped image touches round ends. Their outermost slice has
 # 0.33 of the area of the next one; a cut end has more than 0.6. A cut end also has a part of the

@@ -23,11 +23,11 @@ from avatar_core.geometry.tetwild import fill_box
 _TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
 _COARSE, _FINE, _EDGE = 1100.0, 1750.0, 0.0950  # see _edge; fitted to livers of 2,850 vertices
-_LEAST_FINE = 0.05  # of the vertices wanted
+_LEAST_FINE = 0.05  # fraction of the vertices wanted
 _TRIES = 3  # to meet their number
-_LOST_VOLUME = 0.03  # of the organ, that a mesh may lack; 64 livers at 2,850 vertices: below 0.8 %
+_LOST_VOLUME = 0.03  # largest missing volume of a mesh; 64 livers at 2,850 vertices: below 0.8 %
 
-IN_FACE = (np.ones((3, 3)) + 3.0 * np.eye(3)) / 6.0  # of three points, exact for parabolas
+IN_FACE = (np.ones((3, 3)) + 3.0 * np.eye(3)) / 6.0  # three points, exact for parabolas
 POSTERIOR_SUPERIOR = np.array([0.0, -1.0, 1.0]) / np.sqrt(2.0)
 ANTERIOR = np.array([0.0, 1.0, 0.0])
 

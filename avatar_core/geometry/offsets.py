@@ -18,10 +18,10 @@ import numpy as np
 from avatar_core.common.jit import compiled
 from avatar_core.geometry.skin import Soup
 
-SPACING = 1e-3  # of the grid [m]
+SPACING = 1e-3  # spacing of the grid [m]
 Offsets = Callable[[np.ndarray], np.ndarray]  # q - c(q) of points q (n, 3), shape (n, 3) [m]
 
-MARGIN = 20e-3  # of the grid around the surface [m]; points beyond count as at its border
+MARGIN = 20e-3  # width of the grid around the surface [m]; points beyond count as at its border
 
 
 def exact_offsets(surface: Soup, points: np.ndarray) -> np.ndarray:

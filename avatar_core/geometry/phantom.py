@@ -21,7 +21,7 @@ from avatar_core.geometry.surface import SurfaceMesh
 Vector = tuple[float, float, float]
 LevelSet = Callable[[FloatArray], FloatArray]
 
-VOLUME_GAIN = 0.3  # of a population, det A between 1 / 1.3 and 1.3
+VOLUME_GAIN = 0.3  # largest of a population, det A between 1 / 1.3 and 1.3
 DISTORTION = 0.1  # largest shear
 BEND_LENGTH = 0.3  # wavelength of a bend [m]
 BENT = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))  # moved along one axis, wave along another

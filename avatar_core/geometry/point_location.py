@@ -55,7 +55,7 @@ def locate(mesh: TetMesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
     local = np.linalg.inv(edges)[tet] @ (points[point] - corners[tet, 0])[:, :, None]
     candidate = np.concatenate([1.0 - local.sum(axis=1), local[:, :, 0]], axis=1)
     depth = candidate.min(axis=1)
-    order = np.argsort(depth, kind="stable")  # of several tetrahedra, the deepest is written last
+    order = np.argsort(depth, kind="stable")  # the deepest of several tetrahedra is written last
     order = order[depth[order] >= -_SLACK]
     found, barycentric = np.full(len(points), -1), np.zeros((len(points), 4))
     found[point[order]], barycentric[point[order]] = tet[order], candidate[order]

@@ -24,7 +24,7 @@ from avatar_core.geometry.surface import SurfaceMesh
 _SKFEM_LOG = logging.getLogger("skfem.mesh.mesh")
 _FADE = 1.5  # radii within which fitting to the surface ends
 _LEFT = 0.2e-3  # distance from the surface that may be left where elements would turn [m]
-_ROUNDS, _LESS, _AROUND = 15, 0.7, 2.0  # of taking back motion there: number, factor, reach
+_ROUNDS, _LESS, _AROUND = 15, 0.7, 2.0  # rounds that take back motion: number, factor, reach
 
 
 @dataclass(frozen=True, eq=False)

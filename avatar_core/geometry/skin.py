@@ -24,7 +24,7 @@ CRACK = 0.05  # gaps narrower than this are cracks, no holes [mean edges]
 OFF = 0.01  # a cover farther than this from the surface does not lie on it [mean edges]
 UNDECIDED = (0.25, 0.75)  # winding numbers of a hole's cover, over the layers of the surface
 LARGEST_HOLE = 0.1  # [area of all]; a flat cover loses 3 % of a ball's volume there
-HALVINGS = 3  # of the triangles that an intersection cuts: it is met to an eighth of them
+HALVINGS = 3  # halvings of triangles that an intersection cuts: to an eighth of their size
 BESIDE = 1e-4  # offset of the points tested on the two sides of a triangle [edges]
 
 
@@ -123,7 +123,7 @@ def _covers(vertices: FloatArray, faces: IntArray) -> Soup:
     count = np.bincount(label)
     middles = place[rim].mean(axis=1)
     apices = np.stack([np.bincount(label, middles[:, k]) / count for k in range(3)], axis=1)
-    points = (middles + 2 * apices[label]) / 3  # of each triangle, away from the rim
+    points = (middles + 2 * apices[label]) / 3  # points of each triangle, away from the rim
     squared = igl.point_mesh_squared_distance(points, vertices, faces)[0]
     winding = np.abs(igl.fast_winding_number(vertices, faces, points)) / layers
     open_there = (winding > UNDECIDED[0]) & (winding < UNDECIDED[1])

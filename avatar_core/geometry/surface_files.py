@@ -32,7 +32,7 @@ from avatar_core.geometry.surface_formats import (
 from avatar_core.geometry.vtk_files import read_vtk
 from avatar_core.geometry.vtk_xml_files import read_vtp, stated_axes_of
 
-HEADER_BYTES = 1 << 16  # of a file in which its axes are looked for
+HEADER_BYTES = 1 << 16  # first bytes of a file, where its axes are sought
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from pathlib import Path
 from avatar_core.common import files
 
 MESHES = (".obj", ".stl", ".ply", ".vtk", ".vtp", ".off")
-LABEL_MAPS = (".nii", ".nii.gz", ".nrrd", ".dcm")  # of DICOM, segmentations
+LABEL_MAPS = (".nii", ".nii.gz", ".nrrd", ".dcm")  # for DICOM, segmentations
 SUFFIXES = (*MESHES, *LABEL_MAPS)
 
 MESH_NAMES = ", ".join(suffix[1:].upper() for suffix in MESHES)

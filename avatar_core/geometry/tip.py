@@ -20,9 +20,9 @@ from avatar_core.errors import SceneError
 
 Shape = Literal["sphere", "flat", "cone", "rounded_cone", "patch"]
 USED_BY = {"half_angle": ("cone", "rounded_cone"), "rounding": ("rounded_cone",)}
-ANGLES = (10.0, 85.0)  # of a cone [degrees]
-MAX_DEPTH = 25e-3  # of a pose below the surface at rest, beyond which nothing is computed [m]
-MAX_TOOLS = 8  # that touch at once
+ANGLES = (10.0, 85.0)  # least and largest half angle of a cone [degrees]
+MAX_DEPTH = 25e-3  # largest computed depth of a pose below the surface at rest [m]
+MAX_TOOLS = 8  # tools that touch at once
 
 
 @dataclass(frozen=True)

@@ -118,7 +118,7 @@ def _beneath(radius: float, reach: float) -> tuple[np.ndarray, np.ndarray, np.nd
     Directions (k, 3) have the last component inward; distances (m,) [m] and their weights, which
     sum to one.
     """
-    cosine = ((np.arange(_POLAR) + 0.5) / _POLAR) ** (1.0 / 3.0)  # of the density cos^2
+    cosine = ((np.arange(_POLAR) + 0.5) / _POLAR) ** (1.0 / 3.0)  # by the density cos^2
     angle = 2.0 * np.pi * (np.arange(_AZIMUTHS) + 0.5) / _AZIMUTHS
     c, a = (each.ravel() for each in np.meshgrid(cosine, angle))
     sine = np.sqrt(1.0 - c**2)

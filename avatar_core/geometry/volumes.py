@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import SurfaceError
 
-MAX_VOXEL_BYTES = 2**30  # of a decompressed file
+MAX_VOXEL_BYTES = 2**30  # size of a decompressed file
 
 
 @dataclass(frozen=True)

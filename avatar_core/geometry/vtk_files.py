@@ -157,7 +157,7 @@ class _Reader:
     def _skip_array(self) -> None:
         """Pass over an array of a field: its name, components, tuples, type and numbers."""
         name = self._word()
-        if name == "METADATA":  # of the array before
+        if name == "METADATA":  # metadata of the array before
             self._skip_metadata()
             name = self._word()
         if not name:

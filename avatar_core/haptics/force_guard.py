@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import ContactError
 
-SETTLING = 50e-3  # of valid poses before the force returns [s]
+SETTLING = 50e-3  # time time of valid poses before the force returns [s]
 ENGAGEMENT = 100e-3  # from no force to all of it [s]
 RAMP = 8e-3  # from a force to none; within 10 ms even if a period is late [s]
 _LONGEST = 2e-3  # period for the slew limit, at most [s]

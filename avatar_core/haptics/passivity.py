@@ -54,9 +54,9 @@ Passivity = namedtuple(
     "Passivity",
     [
         "period",  # T [s]
-        "resolution",  # of a coordinate of the tip [m]
-        "tolerance",  # of G [J]
-        "bound",  # of -E [J]
+        "resolution",  # step of a coordinate of the tip [m]
+        "tolerance",  # limit of G [J]
+        "bound",  # limit of -E [J]
         "damping",  # largest c T [N s/m]
         "spread",  # a T^2 [m]
         "energy",  # (T,) E, put in by the tool [J]

@@ -36,7 +36,7 @@ SPHERES = tuple(Tip("sphere", radius) for radius in (1.5e-3, 3e-3, 5e-3, 10e-3))
 DEPTHS = (1e-3, 2e-3, 5e-3)
 LEANING = np.tan(np.radians(2.0))  # off the axis, beyond which it is turned,
 _TURNS = 3  # at most; 20 degrees become 2 and 0.3 degrees
-_REACHES = (1.6, 2.8)  # of a contact that is pressed through its middle: the first that suffices
+_REACHES = (1.6, 2.8)  # reach of a contact pressed through its middle: the first that suffices
 _FITTED = (2.0, 1.5, 1.2)  # radii of the mesh fitted to the surface, over the largest contact's
 
 

@@ -12,7 +12,7 @@ from avatar_core.reduction.regional import RegionalRule, regions_of
 Progress = Callable[[str, float, float], None]  # stage, fraction of it, current error (NaN: none)
 NO_ERROR = float("nan")
 
-_GLOBAL_PART = 0.4  # of the modes that a place may have
+_GLOBAL_PART = 0.4  # fraction of the modes that a place may have
 _REGION_POSITIONS = 30  # least mean number of load positions of a region
 
 

@@ -28,14 +28,14 @@ from avatar_core.reduction.block_modes import BlockModes, compact_order, load_si
 if TYPE_CHECKING:
     from avatar_core.reduction.regional import RegionModes
 
-POINTS = 64  # of a block
+POINTS = 64  # points of a block
 BLOCK = 3 * POINTS  # displacements that are summed together, within the first-level cache
 TOLERANCE = 2e-3  # root mean square of the relative error that blocks add to a load's displacement
 PART = 1e-2  # the same for a part of a displacement, e.g. by large deformation
 _BESIDE = 1e-3  # the same beside the loads: an untouched organ shows only its sag
 
 _NONE = -1  # in a place of a block that is not filled up
-_LARGEST = np.float32(32767)  # of int16: rounding costs 1 / 65536 of a mode's peak
+_LARGEST = np.float32(32767)  # largest int16: rounding costs 1 / 65536 of a mode's peak
 
 
 @dataclass(frozen=True, eq=False)

@@ -199,7 +199,7 @@ class GalerkinBasis:
         )
         cross = mixed.reshape(-1, 3, self.rank) @ load.transpose(0, 2, 1)
         blocks = positive_part(self._own - cross + load @ change.transpose(0, 2, 1))
-        return np.asarray(blocks, float)  # of loads in the space, rounding would be left
+        return np.asarray(blocks, float)  # for loads in the space, rounding would be left
 
     def compliance_trace(self) -> FloatArray:
         """Return the trace of the Galerkin compliance Y Y^T of each patch, (n_positions,) [m/N]."""

@@ -121,7 +121,7 @@ class _Expansion:
         self._space = np.zeros((n_dofs, capacity), order="F")
         self._load = np.zeros((n_loads, capacity), order="F")
         self.rank = 0
-        self.energy = problem.energy.copy()  # of each load, f . K^-1 f - sum_k Y_k^2
+        self.energy = problem.energy.copy()  # residual of each load, f . K^-1 f - sum_k Y_k^2
 
     @property
     def space(self) -> np.ndarray:

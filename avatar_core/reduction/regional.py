@@ -26,7 +26,7 @@ from scipy.cluster.vq import kmeans2
 from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.common.processes import on_all_cores
 
-_ITERATIONS = 30  # of k-means
+_ITERATIONS = 30  # iterations of k-means
 
 
 class RegionModes(NamedTuple):

@@ -21,8 +21,8 @@ from avatar_core.geometry.surface_formats import MESHES, kind_of
 
 COLUMNS = (".xyz", ".csv", ".txt")  # x, y, z in each line
 LEAST_POINTS = 50
-MOST_POINTS = 3000  # that are used; of more a random part, always the same
-FARTHEST = 0.06  # of the middle point of a cloud from the organ's surface [m]
+MOST_POINTS = 3000  # points in use; from more, a random part, always the same
+FARTHEST = 0.06  # largest median distance of a cloud from the organ's surface [m]
 MOST_BYTES = 1 << 30
 _BACKGROUND = 0.1  # distance of a point from the organ at rest beyond which it is none of it [m]
 _DOUBTED = 0.015  # distance of a cloud beyond which its axes are doubted [m]

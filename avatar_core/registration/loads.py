@@ -31,10 +31,10 @@ from avatar_core.vademecum.model import Vademecum
 
 Kind = Literal["smooth", "few", "pressure"]
 
-N_FUNCTIONS = 50  # of each direction; the shortest waves of a liver's front are some 5 cm
-WEIGHT_SPREAD = 5e3  # of a turned weight along each axis, half of a liver's own [N/m^3]
+N_FUNCTIONS = 50  # functions of each direction; the shortest waves of a liver's front are some 5 cm
+WEIGHT_SPREAD = 5e3  # deviation of a turned weight along each axis, half of a liver's own [N/m^3]
 MOST_SITES = 600  # at which a force is sought: some 8 mm apart on a liver
-_LEAST_AREA = 1e-3  # of a position, over the mean one
+_LEAST_AREA = 1e-3  # area of a position, over the mean area
 _BATCH = 300  # columns computed at once
 
 

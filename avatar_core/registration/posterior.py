@@ -24,7 +24,7 @@ from avatar_core.errors import RegistrationError
 
 Spread = Callable[[FloatArray], FloatArray]  # scales -> prior standard deviations (n,)
 
-_STEP = 0.25  # of the differences that give the curvature over the logarithms of the scales
+_STEP = 0.25  # step of the differences for the curvature over the logarithms of the scales
 _WIDEST = 1.0  # standard deviation of a logarithm at most
 _SIMPLEX = 0.4
 

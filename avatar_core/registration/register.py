@@ -30,14 +30,14 @@ _KEPT = 1e-4  # of the largest variance over the surface, below which directions
 _EVERY = 7  # vertices of the surface by which directions are judged
 _MOST_OUTLYING = 0.1
 _MOST_NOISE = 2.0  # noise that is found over that expected
-_MOST_MISMATCH = 0.6  # of the surface, over the noise expected; meshes that differ have 0.1 to 0.4
+_MOST_MISMATCH = 0.6  # mismatch of the surface over the noise expected; others have 0.1 to 0.4
 # Largest mean strain of a fitted deformation. Right answers have up to 0.07 at displacements of
 # 20 mm. Loads that fit a cloud which no load caused have 0.3.
 _MOST_STRAIN = 0.15
-SEEN = 0.015  # of a vertex from the nearest point of the cloud, at most [m]
-_OUT_OF_SIGHT = 0.05  # from which on nothing makes up for the model's error [m]
+SEEN = 0.015  # largest distance of a seen vertex from the cloud [m]
+_OUT_OF_SIGHT = 0.05  # distance beyond which the cloud does not reduce the model's error [m]
 _MOST_HIDDEN = 0.1  # fraction of unseen vertices that may be undetermined in a good answer
-_INSIDE = 5e-3  # of a target from the organ at most [m]
+_INSIDE = 5e-3  # largest distance of a target from the organ [m]
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ import scipy.sparse as sp
 from avatar_core.common.arrays import FloatArray
 
 MOST_FORCES = 3
-_GAIN = 5.0  # of the log likelihood, that one more force needs
+_GAIN = 5.0  # gain of the log likelihood that one more force needs
 
 
 @dataclass(frozen=True, eq=False)

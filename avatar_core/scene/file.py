@@ -205,7 +205,7 @@ def _number(node: Node, path: str, allowed: Any, whole: bool) -> float:
 def _line(node: Node, path: str) -> str:
     if not isinstance(node, ScalarNode):
         raise refused(node, f"{path} is {shown(node)}; write one line of text")
-    text = node.value.rstrip("\n")  # as of > and |
+    text = node.value.rstrip("\n")  # of > and |
     with placed_at(node):
         check_line(path, text)
     return text

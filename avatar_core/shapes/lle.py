@@ -31,7 +31,7 @@ from avatar_core.shapes.weights import (
 )
 
 BLOCK = 8192  # values of each vector per block of the Gram matrix: the blocks stay in cache
-ROUNDING = 4 * float(np.finfo(float).eps)  # of an inner product, relative to the lengths
+ROUNDING = 4 * float(np.finfo(float).eps)  # rounding of an inner product, relative to the lengths
 TRUSTED = 5e-11  # if rounding may change weights by more, they are solved from differences
 CLEAR_GAP = 3.0  # ratio of neighbouring eigenvalues from which a spectral gap is clear
 LOCAL_VARIANCE = 0.99  # part of the variance that the counted principal components explain

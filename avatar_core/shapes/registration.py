@@ -35,7 +35,7 @@ from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.distortion import Distortion
 from avatar_core.shapes.springs import Target, sample_target, surface_springs
 
-PLAUSIBLE_SCALE = (0.5, 2.0)  # of livers against the template, measured 0.82 to 1.27
+PLAUSIBLE_SCALE = (0.5, 2.0)  # scale of livers against the template, measured 0.82 to 1.27
 
 
 @dataclass(frozen=True)

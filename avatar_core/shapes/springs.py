@@ -20,7 +20,7 @@ from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.point_location import barycentric_centroids
 from avatar_core.geometry.surface import SurfaceMesh, winding_number
 
-RETURN_NORMAL_LENGTH = 0.03  # of springs from samples when those from vertices use none [m]
+RETURN_NORMAL_LENGTH = 0.03  # for springs from samples, if those from vertices use none [m]
 _NEAR = 0.5e-3  # distance from a face at which its two sides are distinguished [m]
 _PIECES = 3  # a template face is sampled at the centroids of this number squared of triangles
 

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-JND = 0.07  # of force, that a hand just notices (Jones, Brain 2000; Pang et al. 1991)
+JND = 0.07  # just noticeable difference of force (Jones, Brain 2000; Pang et al. 1991)
 _NOTICED = "7 %: just noticed of a force"
 PERIOD_US = 1000.0
 FRESH = 1001  # seed of loads that no certificate draws

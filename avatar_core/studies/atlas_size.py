@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 AT = 100_000  # anatomies of the estimate on paper
-REAL_MB = 5.4  # of a real anatomy: 120 modes, 49,000 points
+REAL_MB = 5.4  # size of a real anatomy: 120 modes, 49,000 points
 BUILD_SECONDS = 15.0  # CPU time of a real one: registration and response
 # an addition takes as long in a small atlas as in a large one, but for what depends on the size
 ROUGH = TemplateRule(

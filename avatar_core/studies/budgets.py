@@ -12,7 +12,7 @@ from avatar_core.studies.study import Row
 from avatar_core.vademecum.accuracy import Budget, choose
 from avatar_core.vademecum.model import Vademecum
 
-TOLERANCES = (0.02, 0.05, 0.10)  # of the displacement at the surface
+TOLERANCES = (0.02, 0.05, 0.10)  # for the displacement at the surface
 
 
 def budget_rows(vademecum: Vademecum, fresh: StepErrors) -> list[Row]:

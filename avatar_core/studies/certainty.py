@@ -29,7 +29,7 @@ SECTIONS: tuple[Callable[[SurfaceMesh, CertaintySettings, ProgressBar], Section]
     calibration_section,
     registration_section,
 )
-N_STAGES = 7  # of the progress bar, over all sections
+N_STAGES = 7  # stages of the progress bar, over all sections
 
 
 class CertaintyStudy(Study[CertaintySettings]):

@@ -43,7 +43,7 @@ KNOWN: dict[str, Distribution] = {
 COORDINATES = (Coordinate("poisson", 0.40, 0.49), Coordinate("contrast", 0.5, 20.0))
 _LEVELS = (LOW, 0.5, HIGH)
 _DEPTH = 4e-3  # [m]; a patch's force is proportional to it
-_SHRUNK = 0.25  # of the organ's size, the tumour
+_SHRUNK = 0.25  # size of the tumour over the organ's
 _N_VERTICES = 700
 
 

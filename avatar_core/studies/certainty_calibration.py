@@ -42,13 +42,13 @@ if TYPE_CHECKING:
 
 SUPPORTED = "support.bare_area"
 CONTRAST = Coordinate("contrast", 0.7, 30.0)
-STIFFNESS = (5e5, 2e8)  # of the support at the vademecum's Young's modulus [N/m^3]
+STIFFNESS = (5e5, 2e8)  # range of the support at the vademecum's Young's modulus [N/m^3]
 TRUE_YOUNG, TRUE_CONTRAST, TRUE_STIFFNESS = (3e3, 12e3), (2.0, 12.0), (2e6, 2e7)
-N_TOUCHES, N_AT_TUMOUR = 20, 8  # of a trial, and of them over the tumour
+N_TOUCHES, N_AT_TUMOUR = 20, 8  # touches of a trial, and those over the tumour
 POOL, POOL_AT_TUMOUR = 60, 20  # places that trials draw from, away from the tumour and over it
 APART = 4e-3  # places over the tumour, at least [m]
 WELL_KNOWN = 0.05  # largest force error of a touch, which nine in ten keep
-NOISE = 0.02  # of a measured force
+NOISE = 0.02  # relative noise of a measured force
 DEPTHS = (2e-3, 4e-3, 6e-3)  # [m]
 TIP = Tip("patch", 8e-3)
 ERRORS = TouchErrors(sensor=NOISE, least=1e-6, depth=0.1e-3)  # poses and surface are exact here

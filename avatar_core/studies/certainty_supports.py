@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 PLACE = "bare_area"
-LOW, HIGH = 1e5, 1e9  # of the coordinate [N/m^3]
+LOW, HIGH = 1e5, 1e9  # range of the coordinate [N/m^3]
 CLAMP_LIMIT = (1e8, 1e9, 1e10, 1e11, 1e12)
 FREE_LIMIT = (1e5, 1e4, 1e3, 1e2, 1e1, 1.0)
 _N_LIMIT = 4  # load positions of the limits

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ENOUGH = 0.10
-_REGIONS = 4  # of so few loads
+_REGIONS = 4  # regions of so few loads
 
 
 @dataclass(frozen=True)

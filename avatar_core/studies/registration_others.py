@@ -30,7 +30,7 @@ from avatar_core.studies.study import Row, follow
 from avatar_core.vademecum.model import Vademecum
 
 ZONE = 0.03  # radius of the zone in which a force is known to act [m]
-_MOST_NODES = 40  # of the rival, in the zone
+_MOST_NODES = 40  # nodes of the rival, in the zone
 _MILD = 1e-3  # prior displacement of the rival's nodal forces, over which it is not regularised [m]
 
 

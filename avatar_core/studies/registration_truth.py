@@ -37,13 +37,13 @@ SMALL_CLAMP = 0.026  # its radius: 21 cm2 [m]
 _POINT = 6e-3  # radius of the patch of a point force [m]
 _LINEAR = ("point force", "pneumoperitoneum")  # a dead pressure all over would turn the organ
 _GAS = (1e3, 2e3)  # pressure of a pneumoperitoneum, 8 to 15 mmHg [Pa]
-_SHIFT = (10e-3, 45e-3)  # of an organ under a pneumoperitoneum [m]
+_SHIFT = (10e-3, 45e-3)  # shift of an organ under a pneumoperitoneum [m]
 _FRONT = 0.25  # least cosine between the normal of a face that is seen and the view
-_PARTS = (1.0, 0.7, 0.5, 0.35)  # of a load, one of which has an equilibrium
-_DRAWS = 6  # of loads, one of which has an equilibrium
-SOFT = Material(20e3, 0.45)  # of the organ on a small clamp
+_PARTS = (1.0, 0.7, 0.5, 0.35)  # parts of a load, one of which has an equilibrium
+_DRAWS = 6  # draws of loads, one of which has an equilibrium
+SOFT = Material(20e3, 0.45)  # material of the organ on a small clamp
 _STEPS = 4  # in which a support moves
-_MOST_ITERATIONS = 8  # of Newton's method in each
+_MOST_ITERATIONS = 8  # iterations of Newton's method in each
 
 
 @dataclass(frozen=True)

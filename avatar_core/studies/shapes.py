@@ -19,7 +19,7 @@ from avatar_core.studies.study import follow
 DEFAULT_FOLDER = Path("../shared/data/livers")
 
 PAPER_GRID = (43, 31, 37)  # 49,321 values
-PADDING = 0.02  # of the common box beyond all organs [m]
+PADDING = 0.02  # margin of the common box beyond all organs [m]
 
 # Scans of one person under several names (LiTS). They must never be on both sides of a split.
 SAME_SUBJECT = (

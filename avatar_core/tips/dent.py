@@ -51,10 +51,10 @@ from avatar_core.geometry.tip import Tip
 from avatar_core.tips.law import dent
 from avatar_core.tips.profile import INTERVALS, STIFFNESS, TAKEN
 
-REACH = 2.0  # of the change around a tip, in patch radii
+REACH = 2.0  # reach of the change around a tip, in patch radii
 FADE = 1.5  # in patch radii, where it begins to fade
-NODES = 8  # of the Gauss rule
-_ASIDE = 0.5  # of a tip from the nearest load position, in patch radii; farther, all points count
+NODES = 8  # nodes of the Gauss rule
+_ASIDE = 0.5  # of a tip from the nearest load position, in patch radii; beyond, all points count
 _SERIES = 2.0  # contact radii, from where on u_tip is a series, at half the cost
 
 DENT = kind(
@@ -63,7 +63,7 @@ DENT = kind(
     height=array("T i"),  # f(r) [m] over 1 - sqrt(1 - r / radius) in [0, 1]
     node=array(f"2 {NODES}"),  # sin(theta), and 2 / pi cos(theta) times the weight
     patch_radius=array("1"),  # R_p [m]
-    start=array("q", np.int64),  # of the points around each load position, in
+    start=array("q", np.int64),  # first of the points around each load position, in
     around=array("a", np.int32),  # points that a tip near the load position may move
 )
 DENT_STATE = kind(

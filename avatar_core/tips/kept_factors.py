@@ -25,7 +25,7 @@ from avatar_core.tips.shape_factor import factor_of, together
 from avatar_core.vademecum.tip_field import TipField
 
 _IN_MEMORY, _ON_DISK = 4, 64  # factors of some MB each
-_MAX_BYTES = 1 << 28  # of a file
+_MAX_BYTES = 1 << 28  # size of a file
 _ARRAYS = ShapeFactor._fields
 
 

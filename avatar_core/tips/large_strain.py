@@ -38,7 +38,7 @@ COEFFICIENTS = np.array(
         [0.49, 0.00314, 0.18811, -0.32325, 0.20777, 1.375],
     ]
 )
-END, LEAST = 4, 5  # of a tip's six numbers, after c_0 ... c_3
+END, LEAST = 4, 5  # places in a tip's six numbers, after c_0 ... c_3
 NONE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])  # small strain
 
 

@@ -60,7 +60,7 @@ PATCH_ON_MESH = 0.75
 # resolved contacts of balls on LiTS-1, LiTS-4, LiTS-10 and Amos-007. Places are drawn, on ridges,
 # in hollows and at edges. The median estimate is 3.8 times the true error.
 SHAPE_ERROR, SLOPE_ERROR, VARIATION_ERROR = 0.22, 1.2, 0.18
-TUMOUR_ERROR = 0.25  # of the force, per relative change of E* by a tumour underneath
+TUMOUR_ERROR = 0.25  # error of the force per relative change of E* by a tumour underneath
 LEAST_CONTACT = 0.02  # contact radius over the tip's, where the tangent of a light touch is taken
 
 _EVERYWHERE = 1e3  # larger than any organ [m]
@@ -72,11 +72,11 @@ ShapeFactor = namedtuple("ShapeFactor", ["brick", "value", "spacing"])
 LAW = kind(
     "Law",
     profile=array("T i 6"),  # a, da/ds, g, dg/ds, M, Phi over s in [0, 1]
-    radius=array("T"),  # of the tip [m]
+    radius=array("T"),  # radius of the tip [m]
     mindlin=array("1"),  # tangential over normal compliance of a dent, (2 - nu) / (2 (1 - nu))
     error_factor=array("1"),  # on the law's error, of the organ
     modulus=array("1"),  # E* without a tumour [Pa]
-    large_dent=array("T 6"),  # of :func:`avatar_core.tips.large_strain.large_dent_of`
+    large_dent=array("T 6"),  # see :func:`avatar_core.tips.large_strain.large_dent_of`
     local=array("2 x y z", np.float32),  # E* [Pa] and c [m/N] on a grid
     brick=array("bx by bz", np.int32),  # the ShapeFactor
     factor=array(f"T b {BRICK} {BRICK} {BRICK}", np.float32),

@@ -12,7 +12,7 @@ from numpy.polynomial.legendre import leggauss
 
 from avatar_core.geometry.tip import Tip
 
-INTERVALS = 256  # of the table
+INTERVALS = 256  # intervals of the table
 STIFFNESS, TAKEN = range(2)  # columns that a tip's law reads at its place
 LAST = 3.0  # atanh of the last contact radius over the sphere's radius
 

@@ -33,16 +33,16 @@ from avatar_core.tips.law import ShapeFactor
 from avatar_core.tips.profile import profile_of
 from avatar_core.vademecum.tip_field import TipField
 
-SPACING = 1.7e-3  # of the splines [m]
-PRESSED = (1e-3, 8e-3)  # of the lowest point, between which s is computed [m]
+SPACING = 1.7e-3  # spacing of the splines [m]
+PRESSED = (1e-3, 8e-3)  # depths of the lowest point between which s is computed [m]
 ABOVE = 2.0  # spacings over the surface to which it is held, and over which it fades then,
 BELOW = 2.0  # and below the deepest pose
-RETREAT = 0.4  # of the depth, by which the organ gives way: resolved contacts fit 0.3 to 0.6 alike
-MOST = np.log(5.0)  # of |log s|: more is no contact of one place
+RETREAT = 0.4  # part of the depth by which the organ yields: resolved contacts fit 0.3 to 0.6
+MOST = np.log(5.0)  # largest |log s|: more is no contact of one place
 WINDOW = 2.0  # radius within which a tip is pressed, over its contact radius on a plane
 CIRCLES = np.array([0.0625, 0.275, 0.5, 0.72, 0.9375])  # where heights are found, in windows
 STEEPEST = 0.2  # squared cosine of a side's angle, 63 degrees
-_BEYOND = 0.5e-3  # of ``PRESSED``, so that s can be interpolated up to there [m]
+_BEYOND = 0.5e-3  # margin of ``PRESSED``, so that s can be interpolated up to there [m]
 _LEAST = 1e-3  # |log s| below which s is taken as 1
 _NO_LOAD = 1e-18  # [m^2]
 _SHALLOW = 1e-6  # least depth [m]

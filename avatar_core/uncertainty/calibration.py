@@ -54,14 +54,14 @@ from avatar_core.uncertainty.palpation import Palpation, palpation_of
 from avatar_core.vademecum.accuracy import Detail
 from avatar_core.vademecum.model import Vademecum
 
-LEAST_PROBABILITY = 0.01  # of so bad a fit, below which the model is called wrong
-MOST_RMS = 0.25  # of ln F, above which no fit is good; surfaces 0.3 mm off their places give 0.16
+LEAST_PROBABILITY = 0.01  # probability of a fit below which the model is called wrong
+MOST_RMS = 0.25  # misfit of ln F above which no fit is good; surfaces 0.3 mm off give 0.16
 NINETY = 1.6449  # deviations from the middle that hold 90 % of a normal distribution
 _N_WEIGHTINGS = 4  # by the forces that the last one expects
 _FARTHEST = 4.0  # deviations of the tried values from the prior
 _UNKNOWN = 0.1  # error of a force whose place was never certified
 _LEAST_TOUCHES = 3
-_STEP, _FLAT = 0.05, 1e-6  # of a standard normal number; least d ln p / dz
+_STEP, _FLAT = 0.05, 1e-6  # step of a standard normal number; least d ln p / dz
 _TAIL = 4.0  # degrees of freedom of a vademecum's error over the stated one
 
 

@@ -20,8 +20,8 @@ from avatar_core.common.arrays import FloatArray
 from avatar_core.common.files import FileError, content_of, opened, shipped
 from avatar_core.errors import CoordinateError
 
-LEAST_INSIDE = 0.9  # of a distribution's probability that a vademecum's range must hold
-MAX_BYTES = 16_000  # of a file of distributions
+LEAST_INSIDE = 0.9  # least probability of a distribution within a vademecum's range
+MAX_BYTES = 16_000  # largest file of distributions
 SHIPPED = "uncertainty"  # folder of the shipped distributions
 
 

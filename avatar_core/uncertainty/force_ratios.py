@@ -44,7 +44,7 @@ from avatar_core.vademecum.own_compliance import own_compliance, own_compliance_
 
 DEPTHS = 0.5e-3 * 3.0 ** np.arange(4)  # for which forces are found [m]
 DRAWS = 1000
-MAX_POINTS = 625  # of all coordinates together; where there are many, each has fewer
+MAX_POINTS = 625  # points of all coordinates together; with many coordinates, each has fewer
 
 
 def log_edges(

@@ -14,8 +14,8 @@ import numpy as np
 from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import StorageError
 
-N_SAMPLES = 6  # of each touch
-LEAST_FORCE = 0.05  # that counts as a touch [N]
+N_SAMPLES = 6  # samples of each touch
+LEAST_FORCE = 0.05  # least force of a touch [N]
 _RELEASED = 0.5  # of LEAST_FORCE, below which a touch has ended
 _WAY_IN = 10e-3  # path before a touch, which says where the tip came in [m]
 _STEP = 1e-3  # between the points of a way [m]

@@ -35,7 +35,7 @@ _CLEAR = (
     1.5e-3  # between tip and surface, where nothing is touched: five deviations of its place [m]
 )
 _LEAST_OFF = 5  # samples off the organ that determine the zero
-_MOST_LAG, _COARSE, _FINE = 0.4, 0.01, 0.003  # that is looked for, and the steps to it [s]
+_MOST_LAG, _COARSE, _FINE = 0.4, 0.01, 0.003  # largest lag, and the steps of the search [s]
 _LEAST_LAG = 2e-3  # lag below which forces are not shifted [s]
 _SAID = 0.01  # least zero in a notice [N]
 _PAUSE = 0.1  # for which a sample stands, at most [s]

@@ -20,7 +20,7 @@ Cloud = Literal["surface", "volume", "off"]
 
 CONTENT = 0.95  # fraction of the loads below a certified error
 LEVELS = (1, 2, 3, 4, 5, 6, 8)  # numbers of modes that are measured, beside all of them
-_CONFIDENCE = 0.95  # that it does, over draws of the loads that were measured
+_CONFIDENCE = 0.95  # of the bound, over draws of the measured loads
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-COVERED = 0.925  # of the contacts calibrated with, so that fresh ones keep the promise
-PROMISED = 0.9  # of all contacts
+COVERED = 0.925  # fraction of calibration contacts, so that fresh ones keep the promise
+PROMISED = 0.9  # fraction of all contacts
 _FLOORS = np.geomspace(2e-3, 0.2, 15)
-_WORST_OVER_MEAN = 2.06  # that 10 % of half-normal errors exceed
+_WORST_OVER_MEAN = 2.06  # 10 % of half-normal errors exceed this multiple of the mean
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,12 @@ from avatar_core.fem.norms import require_orthonormal
 
 N_VIBRATIONS = 6
 N_BODY = 3 + N_VIBRATIONS
-_WEIGHT = 1e4  # of a liver [N/m^3]
+_WEIGHT = 1e4  # weight of a liver per volume [N/m^3]
 LEAST_MODES = 4 * N_BODY  # with fewer, surface loads need them all
 _DEPENDENT = 1e-6  # part of a body function's energy below which the modes already represent it
 # With 0.03 the sag of a cut phantom was 7 % off at one end of the range.
 _SAME_SAG = 0.005  # singular value of unit sags below which they are one
-_EIGEN_TOLERANCE = 1e-6  # of the slowest vibrations
+_EIGEN_TOLERANCE = 1e-6  # tolerance of the slowest vibrations
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,8 @@ from avatar_core.geometry.mesh import TetMesh
 
 Arrays = Mapping[str, np.ndarray]
 
-LARGEST_LENGTH = 10.0  # of any coordinate or distance of an organ [m]
-_SPACINGS = (1e-4, 0.1)  # of the tip field [m]
+LARGEST_LENGTH = 10.0  # largest coordinate or distance of an organ [m]
+_SPACINGS = (1e-4, 0.1)  # least and largest spacing of the tip field [m]
 _PATCH_RADII = (1e-4, 0.1)  # [m]
 
 # Keys are attribute paths of a Vademecum; see array_shapes for the notation.

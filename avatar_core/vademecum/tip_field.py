@@ -45,11 +45,11 @@ from avatar_core.geometry.tumour import strained_fraction
 SPACING = 2.5e-3  # [m]
 MARGIN = 30e-3  # [m] around the accessible surface
 FAR = 10.0  # [m] value outside the grid
-DEEP_SMOOTHING = 1.0  # of the kernel whose normal leads out of the organ, in spacings
+DEEP_SMOOTHING = 1.0  # width of the kernel whose normal leads out of the organ, in spacings
 DEEPEST = 12.0  # below the outline, where the way out is looked for, in spacings
 ROUND = 1.01  # depth over distance, up to which a side is round
 STEEPEST = 2.5  # depth over distance, at most: thin lobes
-MOST_STEPS = 12  # of the way, each by the distance that is left
+MOST_STEPS = 12  # steps of the way, each by the remaining distance
 SMOOTHING = 0.5  # standard deviation of G, in spacings
 SHARED = (1e-3, 0.1)  # differences of closest points [m] and normals below which f is the same
 FADING = 0.5  # distance beyond the accessible surface over which access fades, in patch radii

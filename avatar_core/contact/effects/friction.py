@@ -49,7 +49,7 @@ class Friction(Effect):
         compliance=array("T T 3 3"),  # C
         offset=array("T 3"),  # c - s_a
         slipped=array("T"),  # distance that the anchor slid in this period [m]
-        matrix=array("3T 3T"),  # of the Newton steps
+        matrix=array("3T 3T"),  # matrix of the Newton steps
         rhs=array("3T"),  # [N]
         give=array("T"),  # tangential compliance of the dent, less the patch's [m/N]
         stiffened=array("T"),  # by how much it fell in this period, at least 0 [m/N]

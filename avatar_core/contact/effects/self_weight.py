@@ -28,7 +28,7 @@ class SelfWeight(Effect):
     name: ClassVar[str] = "self_weight"
     text: ClassVar[str] = "the organ sags under gravity"
 
-    Constants: ClassVar[Any] = kind("SelfWeight", amplitude=array("K"))  # of the modes
+    Constants: ClassVar[Any] = kind("SelfWeight", amplitude=array("K"))  # amplitudes of the modes
     superposed: ClassVar[bool] = True
     moving: ClassVar[bool] = True
 

@@ -44,9 +44,9 @@ class SeveralTools(Effect):
     text: ClassVar[str] = "tools are coupled through the organ"
     Constants: ClassVar[Any] = kind(
         "SeveralTools",
-        reach=array("1"),  # of the near field [m]
+        reach=array("1"),  # reach of the near field [m]
         patch_radius=array("1"),  # [m]
-        meeting=array("i 4"),  # of meeting_table
+        meeting=array("i 4"),  # see meeting_table
     )
     State: ClassVar[Any] = kind(
         "SeveralToolsState",

@@ -49,7 +49,7 @@ class Tilt(Effect):
         "Tilt",
         shaft=array("3"),  # from tip to shaft in the frame of the poses
         punch=array("T"),  # a, 0 for tips that are not flat [m]
-        normals=array("3 x y z", np.float32),  # of the distance on the grid of the tip field
+        normals=array("3 x y z", np.float32),  # surface normals on the grid of the tip field
     )
     State: ClassVar[Any] = kind(
         "TiltState",

@@ -35,7 +35,7 @@ from avatar_core.reduction.near_field import find_block
 
 MAX_HISTORY = 160  # load positions whose history is kept for the near field
 _NEGLIGIBLE = 1e-7  # [N] of a history that is dropped
-_SHOWN = 0.04  # of the strongest load, below which near history is left out of the cloud
+_SHOWN = 0.04  # fraction of the strongest load below which near history is not displayed
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Viscoelasticity(Effect):
         elastic=array("K"),  # Y^T e
         past=array("n K"),  # Y^T h_i
         held=array("K"),  # Y^T of the load that keeps e constant, by `predict_history`
-        slot=array("P", np.int64, -1),  # of a load position in the near history, or -1
+        slot=array("P", np.int64, -1),  # slot of a load position in the near history, or -1
         position=array(f"{MAX_HISTORY}", np.int64),  # load position of a slot
         count=array("1", np.int64),  # slots in use
         near_elastic=array(f"{MAX_HISTORY} 3"),  # e [N]

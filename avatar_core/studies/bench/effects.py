@@ -36,7 +36,7 @@ PUNCH = Tip("flat", SPHERE.radius)
 GRASPER = replace(SPHERE, grasp=Jaw(3e-3, 100.0))
 
 PULLED = 0.05  # fraction of a slide by which a jaw pulls the tissue it holds
-LEAN = np.radians(20.0)  # of the punch off the surface where it sets out
+LEAN = np.radians(20.0)  # angle of the punch off the surface where it sets out
 
 TWO_JAWS = "grasp, two jaws"
 

@@ -32,7 +32,7 @@ from avatar_core.vademecum.accuracy import Cloud
 from avatar_core.vademecum.model import Vademecum
 
 Clock = Callable[[], float]  # in seconds
-Kind = type[np.float32] | type[np.int16]  # of the numbers of a table
+Kind = type[np.float32] | type[np.int16]  # type of the numbers of a table
 
 RADIUS, DEPTH = 10e-3, 5e-3  # [m] of the benchmark's tip, and how deep it slides
 SPHERE, PATCH = Tip("sphere", RADIUS), Tip("patch", RADIUS)

@@ -18,7 +18,7 @@ from avatar_core.studies.bench.methods import PASSES, one_pass
 from avatar_core.vademecum.model import Vademecum
 
 PUSH, DEPTH = 10e-3, 5e-3  # [m] how deep the tools push, and slide
-STEPS = 3600  # of one pass
+STEPS = 3600  # steps of one pass
 
 Waiting = Callable[[str], AbstractContextManager[object]]
 

@@ -22,7 +22,7 @@ from avatar_core.studies.organ import Organ
 from avatar_core.vademecum.display import display_of, outline
 from avatar_core.vademecum.model import Vademecum
 
-MODES = (3, 5)  # that are shown, and all
+MODES = (3, 5)  # numbers of shown modes, beside all
 N_TOOLS = 3  # a sphere has one contact; three of them are at least three
 
 
