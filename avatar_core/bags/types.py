@@ -13,11 +13,11 @@ from avatar_core.errors import StorageError
 POSE = "geometry_msgs/msg/PoseStamped"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 TEXT = "std_msgs/msg/String"
-STATE = "avatar_ros/msg/ContactState"
-CONTACT = "avatar_ros/msg/Contact"
-INFO = "avatar_ros/msg/VademecumInfo"
+STATE = "avatar_interfaces/msg/ContactState"
+CONTACT = "avatar_interfaces/msg/Contact"
+INFO = "avatar_interfaces/msg/VademecumInfo"
 
-# Same as avatar_ros/msg, which the core does not have; definitions in a bag are not compiled.
+# As in avatar_interfaces/msg, which the core does not have; types in a bag are not compiled.
 OWN = {
     CONTACT: """
 geometry_msgs/Point position
@@ -30,7 +30,7 @@ std_msgs/Header header
 string tool
 uint8 status
 string vademecum_id
-avatar_ros/Contact[] contacts
+avatar_interfaces/Contact[] contacts
 float64 force_error
 float64 force_share
 bool held
@@ -102,6 +102,11 @@ def typestore() -> Any:
 
 
 def full_name(name: str) -> str:
-    """Return a type's name with the ``/msg/`` that some writers leave out."""
+    """Return a type's name with the ``/msg/`` that some writers leave out.
+
+    Bags of version 0.2.0 have the types of avatar_interfaces under ``avatar_ros``.
+    """
     package, slash, rest = name.partition("/")
-    return name if not slash or "/" in rest else f"{package}/msg/{rest}"
+    if package == "avatar_ros":
+        package = "avatar_interfaces"
+    return f"{package}{slash}{rest}" if "/" in rest or not slash else f"{package}/msg/{rest}"

@@ -86,18 +86,26 @@ def replaced(path: Path) -> Iterator[Path]:
             whole.unlink(missing_ok=True)
 
 
-def shipped(folder: str) -> dict[str, Path]:
-    """Return the YAML files in a folder of ``params``, by name without suffix; sorted.
+def shipped(name: str) -> Path | None:
+    """Return the path of a file or folder of ``params``; None if it is not installed.
 
-    The folder ``params`` is in the checkout, or below the prefix that pip or colcon installed this
-    package into.
+    It lies in ``params`` of a checkout, or in ``share/avatar_params`` below a prefix. The prefix is
+    that of this package, or one of AMENT_PREFIX_PATH, since colcon has a prefix for each package.
     """
-    here, own = Path(__file__).resolve(), Path("params", folder)
-    installed = [prefix / "share" / "avatar_ros" / own for prefix in here.parents]
-    for found in (here.parents[2] / own, *installed):
-        if found.is_dir():
-            return {path.stem: path for path in sorted(found.glob("*.yaml"))}
-    return {}
+    here = Path(__file__)
+    ament = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    prefixes = [*here.parents, *(Path(prefix) for prefix in ament if prefix)]
+    checkout = here.resolve().parents[2] / "params"
+    for found in (checkout, *(prefix / "share" / "avatar_params" for prefix in prefixes)):
+        if (found / name).exists():
+            return found / name
+    return None
+
+
+def shipped_files(folder: str) -> dict[str, Path]:
+    """Return the YAML files in a folder of ``params``, by name without suffix; sorted."""
+    found = shipped(folder)
+    return {path.stem: path for path in sorted(found.glob("*.yaml"))} if found else {}
 
 
 def _reason(error: OSError | ValueError) -> str:

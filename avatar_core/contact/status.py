@@ -1,7 +1,7 @@
 """Status codes of a tool, from the step or from the loop around it: the one list.
 
-avatar_ros/msg/ContactState.msg, msg_docs/interfaces/contact_state.md and avatar_ros.loop.statuses
-are compared with it by tests/ros/loop/test_statuses.py.
+tests/ros/loop/test_statuses.py compares it with avatar_interfaces/msg/ContactState,
+msg_docs/interfaces/contact_state.md and avatar_ros.loop.statuses.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ import yaml
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from avatar_core.common.dataclass_json import plain
-from avatar_core.common.files import shipped
+from avatar_core.common.files import shipped_files
 from avatar_core.common.quantities import check_line, is_whole, lies_in
 from avatar_core.contact.effects import EFFECTS, Effect, Viscoelasticity
 from avatar_core.errors import SceneError
@@ -49,7 +49,7 @@ _KEYS = ("name", "text", "organ", "material", "tools", "outputs", "effects")
 
 def shipped_scenes() -> dict[str, Path]:
     """Return the files of the scenes that come with the project, by name without suffix; sorted."""
-    return shipped(SHIPPED)
+    return shipped_files(SHIPPED)
 
 
 def shipped_scene(name: str) -> Path:

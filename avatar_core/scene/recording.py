@@ -9,7 +9,7 @@ Layout (schema 2.0). Attributes at the root: ``format`` = "avatar recording", ``
     periods/tip (n, t, 3) [m]    sphere centres as the step used them; far away without a pose
     periods/orientation (n, t, 4) of the tools' frames in the organ's, quaternions x y z w; zero
                                  where it is not known
-    periods/status (n, t)        of avatar_ros/msg/ContactState
+    periods/status (n, t)        of avatar_interfaces/msg/ContactState
     periods/force (n, t, 3) [N]  force of the organ on the tool, before the force guard
     periods/error (n, t) [N]     estimated error of the force, exceeded by one contact in ten
     periods/share (n, t)         fraction of the force that was sent; below 1 if the guard cut it

@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from avatar_core.common.arrays import FloatArray
-from avatar_core.common.files import FileError, content_of, opened, shipped
+from avatar_core.common.files import FileError, content_of, opened, shipped_files
 from avatar_core.errors import CoordinateError
 
 LEAST_INSIDE = 0.9  # least probability of a distribution within a vademecum's range
@@ -228,7 +228,7 @@ def distribution_file(value: str) -> Path:
     """
     if "/" in value:
         return Path(value).expanduser().absolute()
-    known = shipped(SHIPPED)
+    known = shipped_files(SHIPPED)
     if (stem := value.removesuffix(".yaml")) not in known:
         raise CoordinateError(
             f"no distributions {value!r} come with avatar; give a path with a /, or one of "

@@ -106,7 +106,7 @@ class Convergence:
 
 @dataclass(frozen=True)
 class VademecumInfo:
-    """Summary of a vademecum; the fields of avatar_ros/msg/VademecumInfo.
+    """Summary of a vademecum; the fields of avatar_interfaces/msg/VademecumInfo.
 
     Attributes
     ----------

@@ -204,12 +204,12 @@ def _surface() -> Door:
 
 def _loader() -> Door:
     """Load a vademecum as load_vademecum answers a request."""
-    from avatar_ros.framework import conversions
-    from avatar_ros.framework.library import read_in_library
-    from avatar_ros.framework.reader import Reader
     from std_msgs.msg import Header
 
     from avatar_core.vademecum.storage import parse_vademecum
+    from avatar_ros.framework import conversions
+    from avatar_ros.framework.library import read_in_library
+    from avatar_ros.framework.reader import Reader
 
     reader = Reader(MEMORY // 8)
 
@@ -229,12 +229,11 @@ def _patient() -> Door:
     """Read a file as interpolate_patient's process does; every fifth as an inline mesh."""
     from types import SimpleNamespace
 
+    from avatar_interfaces.srv import InterpolatePatient
     from avatar_ros.framework import conversions
     from avatar_ros.framework.reader import Reader
     from avatar_ros.nodes.patient_interpolation import patient_request
     from avatar_ros.patients.surface import read_confined
-
-    from avatar_ros.srv import InterpolatePatient
     from tests.helpers.mesh_mutations import altered_soup, mutant
 
     reader = Reader(MEMORY // 8)

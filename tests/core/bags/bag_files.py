@@ -23,11 +23,11 @@ from avatar_core.vademecum.model import Vademecum
 from tests.helpers.contact import prepare, solve
 from tests.helpers.paths import ROOT
 
-MESSAGES = ROOT / "avatar_ros" / "msg"
+MESSAGES = ROOT / "avatar_ros" / "avatar_interfaces" / "msg"
 PERIOD = 1_000_000  # [ns]
 START = 1_700_000_000_000_000_000  # [ns]
 POSE, WRENCH = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/WrenchStamped"
-STATE, INFO = "avatar_ros/msg/ContactState", "avatar_ros/msg/VademecumInfo"
+STATE, INFO = "avatar_interfaces/msg/ContactState", "avatar_interfaces/msg/VademecumInfo"
 RADIUS = 5e-3
 
 
@@ -36,7 +36,7 @@ def own_types() -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name in ("Contact", "ContactState", "VademecumInfo"):
         text = (MESSAGES / f"{name}.msg").read_text()
-        found |= get_types_from_msg(text, f"avatar_ros/msg/{name}")
+        found |= get_types_from_msg(text, f"avatar_interfaces/msg/{name}")
     return found
 
 
@@ -93,7 +93,13 @@ class Cell:
         """Return a state whose force two contacts divide; the second bears nothing."""
         zero = vector(np.zeros(3))
         contacts = [
-            make("avatar_ros/msg/Contact", vector(self.tip[k], "Point"), zero, vector(part), 0.0)
+            make(
+                "avatar_interfaces/msg/Contact",
+                vector(self.tip[k], "Point"),
+                zero,
+                vector(part),
+                0.0,
+            )
             for part in (self.force[k], np.zeros(3))
         ]
         head = header(int(self.stamp[k]), "organ")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 import sys
 from collections.abc import Callable, Iterable
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -128,10 +130,10 @@ def test_the_computed_forces_are_compared_where_states_are_recorded(
     np.testing.assert_array_equal(path.recording.periods.sent_fraction[:, 0], weak.share)
 
 
-def test_states_of_before_jaws_are_read(
+def test_states_of_version_0_2_are_read(
     organ: Vademecum, cell: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Messages of earlier versions end before ``held``."""
+    """Their type belonged to avatar_ros, and messages ended before ``held``."""
     whole = STORE.serialize_cdr
 
     def shorter(message: Any, kind: str) -> Any:
@@ -139,8 +141,11 @@ def test_states_of_before_jaws_are_read(
         return content[:-1] if kind == STATE else content
 
     monkeypatch.setattr(STORE, "serialize_cdr", shorter)
-    bag = write_rosbag(tmp_path / "bag", cell.messages(states=True))
+    bag = single(".db3", "SQLITE3")(tmp_path, cell.messages(states=True))
     monkeypatch.undo()
+    with closing(sqlite3.connect(bag)) as file, file:
+        file.execute("UPDATE topics SET type = replace(type, 'avatar_interfaces', 'avatar_ros')")
+        file.execute("DELETE FROM message_definitions")
     path, found = replayed(bag, organ)
     assert path.answers == "states" and found.difference(path.recording) <= SAME
 

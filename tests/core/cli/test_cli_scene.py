@@ -63,7 +63,7 @@ def test_shipped_scenes_are_found_where_they_are_installed(
     package.mkdir(parents=True)
     monkeypatch.setattr(files, "__file__", str(package / "common" / "files.py"))
     assert shipped_scenes() == {}
-    folder = tmp_path / "share" / "avatar_ros" / "params" / "scenes"
+    folder = tmp_path / "share" / "avatar_params" / "scenes"
     folder.mkdir(parents=True)
     (folder / "one.yaml").write_text("name: one")
     assert shipped_scenes() == {"one": folder / "one.yaml"}

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from avatar_ros.bench.cell import CellError, run_cell
 from avatar_ros.bench.report import CellMeasurement, CellReport
-
 from tests.helpers.slowness import slowness
 
 

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from avatar_ros.bench.cell import run_cell
 from avatar_ros.bench.footprint import Footprint, FootprintGrowth
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from avatar_ros.bench.idle import ALL, run_idle
-from avatar_ros.framework import qos
 from geometry_msgs.msg import WrenchStamped
 
-from avatar_ros.msg import ContactState
+from avatar_interfaces.msg import ContactState
+from avatar_ros.bench.idle import ALL, run_idle
+from avatar_ros.framework import qos
 from tests.ros.helpers.running import running
 
 pytestmark = pytest.mark.long

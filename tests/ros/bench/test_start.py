@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from avatar_ros.bench.cell import CellError
 from avatar_ros.bench.start import STAGES, run_start
-
 from tests.helpers.slowness import wait_until
 
 pytestmark = pytest.mark.long

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from std_msgs.msg import String
+
 from avatar_ros.framework import qos
 from avatar_ros.framework.announced import Announced
-from std_msgs.msg import String
 
 
 def test_only_a_sole_publisher_is_heard(probe: Any) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.framework import qos
 from geometry_msgs.msg import Point
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetAvailableStates, GetAvailableTransitions, GetState
@@ -23,7 +22,8 @@ from rcl_interfaces.srv import (
 from shape_msgs.msg import Mesh, MeshTriangle
 from type_description_interfaces.srv import GetTypeDescription
 
-from avatar_ros.msg import VademecumInfo
+from avatar_interfaces.msg import VademecumInfo
+from avatar_ros.framework import qos
 from tests.ros.conftest import START_TIMEOUT
 from tests.ros.helpers.running import EXECUTABLES, running
 

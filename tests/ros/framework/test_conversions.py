@@ -6,6 +6,13 @@ import math
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import WrenchStamped
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import PointCloud2
+
+from avatar_interfaces.msg import ContactState
 from avatar_ros.framework.state_template import StateTemplate
 from avatar_ros.framework.templates import (
     CloudTemplate,
@@ -17,13 +24,6 @@ from avatar_ros.framework.templates import (
     stamp_nanoseconds,
 )
 from avatar_ros.loop.tool_channel import OK
-from geometry_msgs.msg import WrenchStamped
-from hypothesis import HealthCheck, example, given, settings
-from hypothesis import strategies as st
-from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import PointCloud2
-
-from avatar_ros.msg import ContactState
 from tests.ros.helpers.stepped_loop import NOW, pose
 
 STAMP = NOW + 123_456_789  # [ns]

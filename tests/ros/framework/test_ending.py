@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from avatar_ros.bench.cell import Module
-from avatar_ros.bench.footprint import children
 
 from avatar_core.vademecum.storage import save_vademecum
+from avatar_ros.bench.cell import Module
+from avatar_ros.bench.footprint import children
 from tests.helpers.processes import has_ended
 from tests.helpers.slowness import end_of, wait_until
 

@@ -9,10 +9,10 @@ import sys
 
 import numpy as np
 import pytest
+
 from avatar_ros.prepare.protocol import Channel
 from avatar_ros.prepare.requests import PreparationRequest
 from avatar_ros.prepare.shared_arrays import map_shared, write_shared
-
 from tests.helpers.slowness import end_of
 
 

@@ -9,6 +9,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+
+from avatar_core.errors import one_line
+from avatar_interfaces.msg import VademecumFile
+from avatar_interfaces.srv import InterpolatePatient
 from avatar_ros.framework import conversions, library
 from avatar_ros.framework.library import RefusedError, file_name, find_in_library, read_in_library
 from avatar_ros.framework.reader import Reader
@@ -18,10 +22,6 @@ from avatar_ros.patients.worker import require_replaceable
 from avatar_ros.prepare.protocol import Channel, Refused
 from avatar_ros.prepare.requests import PreparationRequest
 from avatar_ros.prepare.worker import ModelPreparer
-
-from avatar_core.errors import one_line
-from avatar_ros.msg import VademecumFile
-from avatar_ros.srv import InterpolatePatient
 
 
 @pytest.fixture

@@ -12,15 +12,15 @@ from contextlib import closing
 from typing import Any
 
 import pytest
-from avatar_ros.bench.cell import Module
-from avatar_ros.framework import qos
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from avatar_ros.msg import ContactState, LoopStatistics
+from avatar_interfaces.msg import ContactState, LoopStatistics
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
 from tests.helpers.slowness import slowness
 from tests.ros.conftest import Probe
 from tests.ros.helpers.refusals import refusal

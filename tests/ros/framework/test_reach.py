@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from lifecycle_msgs.srv import GetState
+
 from avatar_ros.framework.discovery import (
     BY_PROFILE,
     LOCAL,
@@ -19,8 +21,6 @@ from avatar_ros.framework.discovery import (
     stay_local,
     udp_alone,
 )
-from lifecycle_msgs.srv import GetState
-
 from tests.helpers.slowness import end_of
 from tests.ros.conftest import START_TIMEOUT
 from tests.ros.helpers.hosts import two_hosts

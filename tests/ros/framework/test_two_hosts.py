@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from avatar_core.vademecum.storage import save_vademecum
-from avatar_ros.msg import ContactState
+from avatar_interfaces.msg import ContactState
 from tests.helpers.paths import ROOT
 from tests.helpers.slowness import Deadline, end_of, slowness
 from tests.ros.helpers.hosts import Hosts, two_hosts
@@ -28,7 +28,7 @@ pytestmark = [pytest.mark.long, pytest.mark.timing]
 SCRIPTS = ROOT / "tests" / "ros" / "helpers"
 LOAD = """
 import sys, time, rclpy
-from avatar_ros.srv import LoadVademecum
+from avatar_interfaces.srv import LoadVademecum
 rclpy.init()
 node = rclpy.create_node("far_planner", enable_rosout=False)
 client = node.create_client(LoadVademecum, "load_vademecum")

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from avatar_ros.bench.cell import Module
 from avatar_ros.ui.view.organ import Organ
 from avatar_ros.ui.view.orientation import FOV, Pose, basis, standard_view, view_beside
-
 from tests.helpers.slowness import Deadline, end_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

@@ -62,9 +62,9 @@ def _build(library: Path) -> None:
 def _state() -> str:
     """Return the first state of the contact node in which it has the vademecum."""
     import rclpy
-    from avatar_ros.framework import qos
 
-    from avatar_ros.msg import ContactState
+    from avatar_interfaces.msg import ContactState
+    from avatar_ros.framework import qos
 
     rclpy.init()
     node = rclpy.create_node("witness")

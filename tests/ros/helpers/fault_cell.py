@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from avatar_ros.bench.cell import Module
-from avatar_ros.framework import qos
 from geometry_msgs.msg import WrenchStamped
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
-from avatar_ros.msg import ContactState, LoopStatistics
+from avatar_interfaces.msg import ContactState, LoopStatistics
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
 from tests.helpers.slowness import Deadline
 from tests.ros.helpers.steady_tool import SWING
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from avatar_ros.framework import qos
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 
-from avatar_ros.msg import ContactState
+from avatar_interfaces.msg import ContactState
+from avatar_ros.framework import qos
 
 
 class Hand:

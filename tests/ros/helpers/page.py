@@ -8,13 +8,13 @@ from typing import Any
 
 import nibabel
 import numpy as np
-from avatar_ros.ui.tools.tool_state import ROW, SharedToolState
-from avatar_ros.ui.view.organ import Organ
 
 from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene
 from avatar_core.scene.recording import Clouds, Periods, Recording
-from avatar_ros.msg import ContactState
+from avatar_interfaces.msg import ContactState
+from avatar_ros.ui.tools.tool_state import ROW, SharedToolState
+from avatar_ros.ui.view.organ import Organ
 
 OK, OUT = ContactState.STATUS_OK, ContactState.STATUS_OUT_OF_RANGE
 NAMES = ("left", "right")  # names of two tools

@@ -8,14 +8,14 @@ from __future__ import annotations
 import gc
 
 import rclpy
+from rclpy.signals import SignalHandlerOptions
+
+from avatar_core.errors import AvatarError
 from avatar_ros.framework.managed_node import ManagedNode
 from avatar_ros.framework.parameters import ParameterError
 from avatar_ros.nodes.contact import ContactNode
 from avatar_ros.nodes.patient_interpolation import PatientInterpolationNode
 from avatar_ros.nodes.vademecum_loader import LoaderNode
-from rclpy.signals import SignalHandlerOptions
-
-from avatar_core.errors import AvatarError
 from tests.ros.conftest import free_domain
 
 NODES: dict[str, type[ManagedNode]] = {

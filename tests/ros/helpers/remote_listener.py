@@ -12,10 +12,10 @@ import math
 import time
 
 import rclpy
-from avatar_ros.framework import qos
 from geometry_msgs.msg import WrenchStamped
 
-from avatar_ros.msg import ContactState
+from avatar_interfaces.msg import ContactState
+from avatar_ros.framework import qos
 
 
 def main() -> None:

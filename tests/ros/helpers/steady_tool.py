@@ -12,9 +12,10 @@ import time
 
 import numpy as np
 import rclpy
+from geometry_msgs.msg import PoseStamped
+
 from avatar_ros.framework import qos, realtime
 from avatar_ros.framework.templates import PoseTemplate, stamp_bytes
-from geometry_msgs.msg import PoseStamped
 
 MEAN, SWING, FREQUENCY = 1.5e-3, 1.0e-3, 2.0  # depth [m], [m], [Hz]
 

@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
-from avatar_ros.loop import contact_loop
-from avatar_ros.loop.contact_loop import ActiveModel, ContactLoop
-from avatar_ros.loop.safety import Safety
-from avatar_ros.loop.settings import LoopSettings
-from avatar_ros.loop.tool_channel import OK, ToolChannel
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, WrenchStamped
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
 from avatar_core.geometry.tip import Tip
-from avatar_ros.msg import ContactState
+from avatar_interfaces.msg import ContactState
+from avatar_ros.loop import contact_loop
+from avatar_ros.loop.contact_loop import ActiveModel, ContactLoop
+from avatar_ros.loop.safety import Safety
+from avatar_ros.loop.settings import LoopSettings
+from avatar_ros.loop.tool_channel import OK, ToolChannel
 from tests.helpers.contact import prepare
 from tests.ros.helpers.unlimited_guard import UnlimitedGuard
 

@@ -13,10 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.loop.contact_loop import ActiveModel
-from avatar_ros.loop.device import ToolDevice
-from avatar_ros.loop.safety import Safety
-from avatar_ros.loop.tool_channel import OK, ToolChannel
 from builtin_interfaces.msg import Time
 from crtk_msgs.msg import OperatingState
 from geometry_msgs.msg import WrenchStamped
@@ -24,7 +20,11 @@ from rclpy.serialization import deserialize_message
 
 from avatar_core.geometry.tip import Tip
 from avatar_core.haptics.force_guard import ENGAGEMENT, SETTLING, ForceGuard, ForceLimits
-from avatar_ros.msg import ContactState
+from avatar_interfaces.msg import ContactState
+from avatar_ros.loop.contact_loop import ActiveModel
+from avatar_ros.loop.device import ToolDevice
+from avatar_ros.loop.safety import Safety
+from avatar_ros.loop.tool_channel import OK, ToolChannel
 from tests.helpers.contact import prepare
 from tests.ros.helpers.stepped_loop import SteppedLoop, pose
 

@@ -6,11 +6,12 @@ import math
 from typing import Any
 
 import pytest
-from avatar_ros.framework.parameters import ParameterError
-from avatar_ros.loop.jaw import JawChannel, JointReader, chosen_jaw
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
+
+from avatar_ros.framework.parameters import ParameterError
+from avatar_ros.loop.jaw import JawChannel, JointReader, chosen_jaw
 
 
 class Driver:

@@ -11,11 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
-from avatar_ros.framework.templates import WrenchTemplate, stamp_bytes
-from avatar_ros.loop.contact_loop import BLEND, ActiveModel, ContactLoop
-from avatar_ros.loop.settings import LoopSettings
-from avatar_ros.loop.statistics import TimingRecord
-from avatar_ros.loop.tool_channel import OK
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
@@ -23,6 +18,11 @@ from sensor_msgs.msg import PointCloud2
 
 from avatar_core.contact.effects import Friction, Viscoelasticity
 from avatar_core.geometry.tip import Tip
+from avatar_ros.framework.templates import WrenchTemplate, stamp_bytes
+from avatar_ros.loop.contact_loop import BLEND, ActiveModel, ContactLoop
+from avatar_ros.loop.settings import LoopSettings
+from avatar_ros.loop.statistics import TimingRecord
+from avatar_ros.loop.tool_channel import OK
 from tests.helpers.contact import prepare
 from tests.helpers.slowness import slowness
 from tests.ros.helpers.unlimited_guard import UnlimitedGuard

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import sys
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
-from avatar_ros.loop.device import ToolDevice
-from avatar_ros.loop.diagnostics import FaultCounter
-from avatar_ros.loop.safety import COMMANDS
-from avatar_ros.loop.tool_channel import ToolChannel
 from builtin_interfaces.msg import Time
 from crtk_msgs.msg import OperatingState
 
-from avatar_ros.msg import ContactState
+from avatar_interfaces.msg import ContactState
+from avatar_ros.framework.parameters import ParameterError
+from avatar_ros.loop.device import ToolDevice, devices
+from avatar_ros.loop.diagnostics import FaultCounter
+from avatar_ros.loop.safety import COMMANDS, Safety
+from avatar_ros.loop.tool_channel import ToolChannel
 from tests.ros.helpers.refusals import refusal
 
 NOTHING, NOT_ENABLED, NOT_HOMED = (
@@ -131,3 +135,12 @@ def test_a_command_without_a_state_or_a_meaning_is_refused(values: list[str], re
     said = refusal("contact", *values)
     assert said.startswith("parameter tool_state_command: ") and reason in said
     assert "\n" not in said
+
+
+def test_a_workspace_without_crtk_msgs_refuses_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "crtk_msgs", None)
+    settings: Any = SimpleNamespace(
+        tools=("left",), safety_of=lambda name: Safety(hears_state=True)
+    )
+    with pytest.raises(ParameterError, match=r"^parameter tool_operating_state: .* clone it"):
+        devices(Mock(), settings, [ToolChannel(None, None, "organ")])

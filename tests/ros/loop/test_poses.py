@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.loop.contact_loop import ActiveModel
-from avatar_ros.loop.diagnostics import FaultCounter
-from avatar_ros.loop.statistics import statistics
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
 
-from avatar_ros.msg import ContactState
+from avatar_interfaces.msg import ContactState
+from avatar_ros.loop.contact_loop import ActiveModel
+from avatar_ros.loop.diagnostics import FaultCounter
+from avatar_ros.loop.statistics import statistics
 from tests.ros.helpers.stepped_loop import NOW, SECOND, TIP, pose
 
 OK, INVALID = int(ContactState.STATUS_OK), int(ContactState.STATUS_INVALID_POSE)

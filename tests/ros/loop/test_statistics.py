@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+
 from avatar_ros.loop.statistics import TimingRecord, statistics
 
 PERIOD = 1_000_000  # [ns]

@@ -5,10 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from avatar_ros.loop.statuses import EXPLANATIONS
-
 from avatar_core.contact.status import Status
-from avatar_ros.msg import ContactState
+from avatar_interfaces.msg import ContactState
+from avatar_ros.loop.statuses import EXPLANATIONS
 from tests.helpers.paths import ROOT
 
 Row = tuple[int, str, str]  # number, name, meaning
@@ -23,7 +22,7 @@ def rows(path: str, pattern: str) -> Iterator[Row]:
 
 def test_the_message_has_them() -> None:
     pattern = r"^uint8 STATUS_(?P<name>\w+)=(?P<number>\d+) +# (?P<meaning>.+)$"
-    assert list(rows("avatar_ros/msg/ContactState.msg", pattern)) == CODES
+    assert list(rows("avatar_ros/avatar_interfaces/msg/ContactState.msg", pattern)) == CODES
     for number, name, _ in CODES:  # as generated
         assert getattr(ContactState, f"STATUS_{name}") == number
 

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.framework.templates import rotated
-from avatar_ros.loop.contact_loop import ActiveModel
-from avatar_ros.loop.safety import Safety
-from avatar_ros.loop.tool_channel import ToolChannel
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
 
 from avatar_core.contact.effects import Tilt
 from avatar_core.geometry.tip import Tip
+from avatar_ros.framework.templates import rotated
+from avatar_ros.loop.contact_loop import ActiveModel
+from avatar_ros.loop.safety import Safety
+from avatar_ros.loop.tool_channel import ToolChannel
 from tests.helpers.contact import prepare, solve, turning
 from tests.ros.conftest import TIP_RADIUS, TOUCH_DEPTH
 from tests.ros.helpers.stepped_loop import SteppedLoop, pose

@@ -8,9 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.bench.cell import Module
-from avatar_ros.framework import qos
-from avatar_ros.framework.ports import PolledSubscriptions
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -23,7 +20,10 @@ from avatar_core.scene.file import write_scene
 from avatar_core.scene.model import Scene
 from avatar_core.scene.replay import replay
 from avatar_core.vademecum.storage import load_vademecum
-from avatar_ros.msg import ContactState, VademecumInfo
+from avatar_interfaces.msg import ContactState, VademecumInfo
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
+from avatar_ros.framework.ports import PolledSubscriptions
 from tests.core.bags.bag_files import STORE
 from tests.helpers.slowness import Deadline
 

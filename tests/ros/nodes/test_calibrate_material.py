@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.bench.cell import Module
-from avatar_ros.bench.footprint import children
 
 from avatar_core.common.child import computed_by
 from avatar_core.scene.recording import load_recording, save_recording
 from avatar_core.vademecum.storage import save_vademecum
-from avatar_ros.srv import CalibrateMaterial, LoadVademecum
+from avatar_interfaces.srv import CalibrateMaterial, LoadVademecum
+from avatar_ros.bench.cell import Module
+from avatar_ros.bench.footprint import children
 from tests.helpers.processes import has_ended
 from tests.helpers.slowness import wait_until
 from tests.helpers.soft_organ import organ_on_springs

@@ -11,18 +11,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.bench import bare_loop
-from avatar_ros.framework import qos
-from avatar_ros.framework.conversions import vademecum_file
-from avatar_ros.loop.statuses import EXPLANATIONS
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
 
 from avatar_core.vademecum.storage import parse_vademecum
-from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile, VademecumInfo
-from avatar_ros.srv import LoadVademecum
+from avatar_interfaces.msg import ContactState, LoopStatistics, VademecumFile, VademecumInfo
+from avatar_interfaces.srv import LoadVademecum
+from avatar_ros.bench import bare_loop
+from avatar_ros.framework import qos
+from avatar_ros.framework.conversions import vademecum_file
+from avatar_ros.loop.statuses import EXPLANATIONS
 from tests.helpers.slowness import Deadline
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.helpers.answers import ROUNDING, took

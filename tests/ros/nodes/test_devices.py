@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.loop.safety import WRENCHES, Safety
-from avatar_ros.loop.tool_channel import ToolChannel
 from crtk_msgs.msg import OperatingState
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
 
-from avatar_ros.msg import ContactState
+from avatar_interfaces.msg import ContactState
+from avatar_ros.loop.safety import WRENCHES, Safety
+from avatar_ros.loop.tool_channel import ToolChannel
 from tests.helpers.paths import PARAMS
 from tests.ros.conftest import PATIENT
 from tests.ros.helpers.refusals import refusal

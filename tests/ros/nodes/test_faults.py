@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
+from avatar_interfaces.srv import InterpolatePatient, LoadScene, LoadVademecum
 from tests.helpers.slowness import end_of, slowness, wait_until
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.helpers.fault_cell import MOST, FaultCell, Harm, Silence

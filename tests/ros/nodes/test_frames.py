@@ -7,10 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.framework import qos
-from avatar_ros.framework.parameters import IDENTITY
-from avatar_ros.loop.safety import Safety
-from avatar_ros.nodes.contact_frames import static_transforms
 from builtin_interfaces.msg import Time
 from crtk_msgs.msg import OperatingState, StringStamped
 from geometry_msgs.msg import TransformStamped
@@ -18,7 +14,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from scipy.spatial.transform import Rotation
 from tf2_msgs.msg import TFMessage
 
-from avatar_ros.msg import ContactState
+from avatar_interfaces.msg import ContactState
+from avatar_ros.framework import qos
+from avatar_ros.framework.parameters import IDENTITY
+from avatar_ros.loop.safety import Safety
+from avatar_ros.nodes.contact_frames import static_transforms
 from tests.ros.helpers.refusals import refusal
 from tests.ros.helpers.running import running
 

@@ -14,17 +14,17 @@ from typing import Any
 
 import pytest
 import yaml
-from avatar_ros.framework import qos
-from avatar_ros.nodes import cell
 
 from avatar_core.cli.cell import cell as avatar_cell
-from avatar_ros.msg import ContactState
+from avatar_interfaces.msg import ContactState
+from avatar_ros.framework import qos
+from avatar_ros.nodes import cell
 from tests.helpers.slowness import end_of
 from tests.ros.conftest import START_TIMEOUT
 from tests.ros.helpers import fake_launch
 from tests.ros.helpers.doc_pages import ROOT
 
-FOLDER = ROOT / "avatar_ros" / "launch"
+FOLDER = ROOT / "avatar_ros" / "avatar_ros" / "launch"
 PARAMS = ROOT / "params" / "planning_cell.yaml"
 # as `ros2 launch FILE name:=value` does it (ros2launch.api.launch_a_launch_file)
 ROS2_LAUNCH = """
@@ -87,7 +87,7 @@ def as_yaml(value: Any) -> str:
 def test_without_arguments_it_starts_what_needs_none_from_the_installed_file(
     file: dict[str, Any],
 ) -> None:
-    installed = Path(sys.prefix, "share/avatar_ros/params/planning_cell.yaml")
+    installed = Path(sys.prefix, "share/avatar_params/planning_cell.yaml")
     found = started(file, "ui:=false", "atlas:=")
     assert set(found) == {"vademecum_loader", "contact"}
     for params, values in found.values():

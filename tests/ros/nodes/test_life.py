@@ -13,18 +13,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from avatar_ros.bench.cell import Module
-from avatar_ros.bench.footprint import children
-from avatar_ros.framework import qos
-from avatar_ros.framework.conversions import vademecum_file
-from avatar_ros.nodes.cell import node_arguments, wait_after
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 
 from avatar_core.cli.cell import cell
-from avatar_ros.msg import ContactState, LoopStatistics, VademecumFile
+from avatar_interfaces.msg import ContactState, LoopStatistics, VademecumFile
+from avatar_ros.bench.cell import Module
+from avatar_ros.bench.footprint import children
+from avatar_ros.framework import qos
+from avatar_ros.framework.conversions import vademecum_file
+from avatar_ros.nodes.cell import node_arguments, wait_after
 from tests.helpers.slowness import end_of, wait_until
 from tests.ros.conftest import START_TIMEOUT
 from tests.ros.helpers.doc_pages import ROOT
@@ -182,9 +182,12 @@ def _run(shell: dict[str, str], code: str) -> str:
 def test_the_prefix_is_found_by_ament(shell: dict[str, str]) -> None:
     code = "from ament_index_python.packages import get_package_prefix as p; print(p('avatar_ros'))"
     assert Path(_run(shell, code)).resolve() == PREFIX.resolve()
-    share = PREFIX / "share" / "avatar_ros"
-    for wanted in ("package.xml", "launch/planning_cell.launch.py", "params/planning_cell.yaml"):
-        assert (share / wanted).is_file()
+    for wanted in (
+        "avatar_ros/package.xml",
+        "avatar_ros/launch/planning_cell.launch.py",
+        "avatar_params/planning_cell.yaml",
+    ):
+        assert (PREFIX / "share" / wanted).is_file()
 
 
 @pytest.mark.long

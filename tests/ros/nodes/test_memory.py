@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+from avatar_core.common.confined import Imported
+from avatar_interfaces.msg import ContactState
+from avatar_interfaces.srv import LoadVademecum
 from avatar_ros.bench.footprint import Footprint, children
 from avatar_ros.framework import qos
 from avatar_ros.framework.reader import Reader
-
-from avatar_core.common.confined import Imported
-from avatar_ros.msg import ContactState
-from avatar_ros.srv import LoadVademecum
 from tests.helpers.processes import has_ended
 from tests.helpers.slowness import Deadline, wait_until
 from tests.ros.conftest import START_TIMEOUT

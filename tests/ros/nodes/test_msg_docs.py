@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from avatar_ros.bench.cell import Module
-from avatar_ros.framework import qos
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.duration import Infinite
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
-from avatar_ros.msg import ContactState
+from avatar_interfaces.msg import ContactState
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
 from tests.ros.conftest import newcomer
 from tests.ros.helpers.doc_pages import (
     PAGES,

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from visualization_msgs.msg import Marker
+
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.ui.view.colours import colours, table, top_for
-from visualization_msgs.msg import Marker
-
 from tests.helpers.paths import PARAMS
 from tests.helpers.slowness import within
 from tests.ros.helpers.doc_pages import entry, index, topic

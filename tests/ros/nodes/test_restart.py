@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import WrenchStamped
+
+from avatar_interfaces.msg import ContactState, LoopStatistics, VademecumInfo
+from avatar_interfaces.srv import InterpolatePatient, LoadScene, LoadVademecum
 from avatar_ros.framework import qos
 from avatar_ros.framework.parameters import ParameterError
 from avatar_ros.framework.saved_state import SavedState
-from geometry_msgs.msg import WrenchStamped
-
-from avatar_ros.msg import ContactState, LoopStatistics, VademecumInfo
-from avatar_ros.srv import InterpolatePatient, LoadScene, LoadVademecum
 from tests.helpers.slowness import end_of, wait_until
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.helpers.fault_cell import FaultCell

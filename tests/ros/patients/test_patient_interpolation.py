@@ -13,10 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
-from avatar_ros.bench.cell import Module
-from avatar_ros.bench.footprint import children
-from avatar_ros.framework import qos
-from avatar_ros.framework.conversions import surface_mesh
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.srv import DescribeParameters
@@ -28,9 +24,13 @@ from avatar_core.atlas.storage import load_atlas, save_anatomy, save_frame
 from avatar_core.common.child import computed_by
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.vademecum.storage import load_vademecum
-from avatar_ros.action import BuildPatient
-from avatar_ros.msg import ContactState
-from avatar_ros.srv import InterpolatePatient, LoadVademecum
+from avatar_interfaces.action import BuildPatient
+from avatar_interfaces.msg import ContactState
+from avatar_interfaces.srv import InterpolatePatient, LoadVademecum
+from avatar_ros.bench.cell import Module
+from avatar_ros.bench.footprint import children
+from avatar_ros.framework import qos
+from avatar_ros.framework.conversions import surface_mesh
 from tests.helpers.processes import has_ended
 from tests.helpers.slowness import end_of, within
 from tests.ros.conftest import newcomer

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.framework import qos
-from avatar_ros.loop.shown_modes import ShownModes, ShownModesReport
-from avatar_ros.nodes.contact_reports import ShownModesLog
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from avatar_core.errors import AccuracyError
 from avatar_core.vademecum.accuracy import Budget
-from avatar_ros.msg import ContactState, LoopStatistics
+from avatar_interfaces.msg import ContactState, LoopStatistics
+from avatar_ros.framework import qos
+from avatar_ros.loop.shown_modes import ShownModes, ShownModesReport
+from avatar_ros.nodes.contact_reports import ShownModesLog
 from tests.helpers.contact import prepare
 from tests.ros.conftest import START_TIMEOUT, Probe
 from tests.ros.helpers.hand import Hand, felt

@@ -14,11 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.loop.contact_loop import BLEND, ActiveModel
-from avatar_ros.loop.safety import Safety, band_topics
-from avatar_ros.loop.settings import CHANGEABLE, CONTACT
-from avatar_ros.loop.tool_channel import OK, ToolChannel
-from avatar_ros.prepare.bands import BandPreparer, usable_known
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
 
@@ -30,6 +25,11 @@ from avatar_core.uncertainty import force_ratios
 from avatar_core.uncertainty.distributions import Fixed, Lognormal, Uniform, mappings
 from avatar_core.uncertainty.force_ratios import DEPTHS
 from avatar_core.uncertainty.known import Held
+from avatar_ros.loop.contact_loop import BLEND, ActiveModel
+from avatar_ros.loop.safety import Safety, band_topics
+from avatar_ros.loop.settings import CHANGEABLE, CONTACT
+from avatar_ros.loop.tool_channel import OK, ToolChannel
+from avatar_ros.prepare.bands import BandPreparer, usable_known
 from tests.helpers.contact import prepare
 from tests.helpers.soft_organ import soft_organ
 from tests.ros.helpers.refusals import refusal

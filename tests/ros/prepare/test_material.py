@@ -12,9 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.bench.cell import Module
-from avatar_ros.framework import qos
-from avatar_ros.prepare.scenes import usable_material
 
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.geometry.phantom import phantom_liver
@@ -22,8 +19,11 @@ from avatar_core.offline.rule import BuildRule
 from avatar_core.pipeline import OrganOptions, build
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.vademecum.storage import save_vademecum
-from avatar_ros.msg import ContactState, LoopStatistics
-from avatar_ros.srv import LoadVademecum
+from avatar_interfaces.msg import ContactState, LoopStatistics
+from avatar_interfaces.srv import LoadVademecum
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
+from avatar_ros.prepare.scenes import usable_material
 from tests.helpers.disk_cache import cached_on_disk
 from tests.helpers.slowness import Deadline
 from tests.ros.conftest import PATIENT

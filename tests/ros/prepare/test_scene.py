@@ -12,10 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.bench.cell import Module
-from avatar_ros.framework import qos
-from avatar_ros.prepare.requests import PreparationRequest
-from avatar_ros.prepare.scenes import model_spec
 from geometry_msgs.msg import Quaternion, WrenchStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
@@ -24,8 +20,12 @@ from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import read_scene, shipped_scene
 from avatar_core.scene.yaml_lines import MAX_BYTES
-from avatar_ros.msg import ContactState
-from avatar_ros.srv import LoadScene
+from avatar_interfaces.msg import ContactState
+from avatar_interfaces.srv import LoadScene
+from avatar_ros.bench.cell import Module
+from avatar_ros.framework import qos
+from avatar_ros.prepare.requests import PreparationRequest
+from avatar_ros.prepare.scenes import model_spec
 from tests.helpers.paths import PARAMS
 from tests.helpers.slowness import Deadline
 from tests.ros.conftest import START_TIMEOUT, free_domain

@@ -6,18 +6,18 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-from avatar_ros.loop.settings import CONTACT, MATERIAL, chosen_material
-from avatar_ros.nodes.contact import ContactNode
-from avatar_ros.prepare.scenes import usable_material
-from avatar_ros.ui.session.presets import HINTS, SLIDERS
-from avatar_ros.ui.session.recorder import scene_in_force
-from avatar_ros.ui.view.organ import Organ
 
 from avatar_core.common.supports import ATTACHMENTS
 from avatar_core.scene.file import parse_scene, write_scene
 from avatar_core.scene.model import SupportStiffness, Tool
 from avatar_core.scene.prepare import scene_spec
 from avatar_core.vademecum.model import Vademecum
+from avatar_ros.loop.settings import CONTACT, MATERIAL, chosen_material
+from avatar_ros.nodes.contact import ContactNode
+from avatar_ros.prepare.scenes import usable_material
+from avatar_ros.ui.session.presets import HINTS, SLIDERS
+from avatar_ros.ui.session.recorder import scene_in_force
+from avatar_ros.ui.view.organ import Organ
 from tests.core.offline.test_coordinates import BARE, YOUNG
 from tests.helpers.soft_organ import organ_on_springs
 

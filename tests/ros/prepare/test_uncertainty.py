@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.framework import qos
 from geometry_msgs.msg import WrenchStamped
 from rcl_interfaces.msg import Log
 
+from avatar_ros.framework import qos
 from tests.helpers.slowness import Deadline
 from tests.ros.helpers.hand import Hand, force_of, stamp_of
 from tests.ros.helpers.parameters import parameter_values, set_parameter

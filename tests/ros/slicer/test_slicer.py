@@ -15,18 +15,18 @@ import pytest
 pytest.importorskip("pyigtl", reason="the extra slicer is not installed")
 
 import pyigtl
+from pyigtl.messages import message_type_to_class_constructor as kinds
+from rclpy.action import ActionServer
+from sensor_msgs.msg import PointCloud2
+
+from avatar_interfaces.action import BuildPatient
+from avatar_interfaces.msg import ContactState
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.nodes.slicer_bridge import SLICER_BRIDGE
 from avatar_ros.slicer import messages
 from avatar_ros.slicer.follower import LONGEST, Follower
 from avatar_ros.slicer.link import MAX_BODY, Link
-from pyigtl.messages import message_type_to_class_constructor as kinds
-from rclpy.action import ActionServer
-from sensor_msgs.msg import PointCloud2
-
-from avatar_ros.action import BuildPatient
-from avatar_ros.msg import ContactState
 from tests.helpers.slowness import Deadline, end_of, wait_until, within
 from tests.ros.helpers.doc_pages import parameter_rows, yaml_parameters
 from tests.ros.helpers.hand import wait_for_model

@@ -15,7 +15,7 @@ from tests.ros.conftest import PATIENT
 
 _NEEDED = {
     "rclpy": "ROS 2 is not installed",
-    "avatar_ros.msg": "avatar_ros is not installed",
+    "avatar_interfaces.msg": "avatar_ros is not installed",
     "viser": "viser is not installed: pip install '.[ui]'",
 }
 
@@ -63,7 +63,6 @@ def cube() -> Any:
 def state() -> Any:
     """Make the memory that the page shares with the driver of two tools."""
     from avatar_ros.ui.tools.tool_state import SharedToolState
-
     from tests.ros.helpers.page import PLACES
 
     made = SharedToolState.make()
@@ -147,8 +146,7 @@ def page(nodes: Any, port: int, shots: Path) -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def shown(folder: Path, nodes: Any) -> Any:
     """Return the organ that the page shows first."""
-    from avatar_ros.ui.view.organ import Organ
-
     from avatar_core.vademecum.storage import load_vademecum
+    from avatar_ros.ui.view.organ import Organ
 
     return Organ.of(load_vademecum(folder / "liver.h5"))

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.bench.cell import Module
-from avatar_ros.ui.session.shown_period import SILENT
-from avatar_ros.ui.view.organ import Organ
 
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.storage import save_vademecum
-from avatar_ros.srv import LoadVademecum
+from avatar_interfaces.srv import LoadVademecum
+from avatar_ros.bench.cell import Module
+from avatar_ros.ui.session.shown_period import SILENT
+from avatar_ros.ui.view.organ import Organ
 from tests.helpers.slowness import Deadline
 from tests.ros.conftest import PATIENT, Probe
 from tests.ros.helpers.browser import (

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.ui.view.organ import Organ
 
+from avatar_ros.ui.view.organ import Organ
 from tests.ros.helpers.browser import (
     beside_pose,
     choose,

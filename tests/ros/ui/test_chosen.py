@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from avatar_core.geometry.tip import Tip
+from avatar_core.scene.file import read_scene, shipped_scene
 from avatar_ros.loop.settings import MATERIAL
 from avatar_ros.ui.session.chosen import Chosen
 from avatar_ros.ui.session.recordings import Page, Recordings
 from avatar_ros.ui.tools.tool_state import SharedToolState
 from avatar_ros.ui.view.organ import Organ
 from avatar_ros.ui.view.view import CUT, GLASS, WHOLE
-
-from avatar_core.geometry.tip import Tip
-from avatar_core.scene.file import read_scene, shipped_scene
 from tests.ros.helpers.page import NAMES, PLACES, UP, Noted
 
 RANGES = {"young": (1e3, 1e6, 170e3), "poisson": (0.40, 0.49, 0.48)}  # least, most, as built

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from avatar_core.geometry.tip import Tip
+from avatar_core.vademecum.certificate import Certificate
 from avatar_ros.ui.session.coloured import DISPLACEMENT, ERROR, SPREAD, Coloured
 from avatar_ros.ui.view import tone
 from avatar_ros.ui.view.bands import cut
 from avatar_ros.ui.view.colours import N_BANDS, band_colours, tissue_colours
 from avatar_ros.ui.view.organ import Organ
-
-from avatar_core.geometry.tip import Tip
-from avatar_core.vademecum.certificate import Certificate
 from tests.helpers.box_organ import organ
 from tests.helpers.small_files import ball
 from tests.ros.helpers.page import Noted

@@ -8,11 +8,11 @@ from http.client import HTTPConnection, HTTPResponse
 
 import pytest
 import viser
-from avatar_ros.ui.server.guard import Guard, guarded
-from avatar_ros.ui.server.index_page import ALIVE
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from avatar_ros.ui.server.guard import Guard, guarded
+from avatar_ros.ui.server.index_page import ALIVE
 from tests.ros.helpers.browser import TOKEN, free_port
 
 ELSEWHERE = "http://127.0.0.1:1"  # same site for cookies, another origin

@@ -6,8 +6,9 @@ import gzip
 
 import numpy as np
 import pytest
-from avatar_ros.ui.server.index_page import BLUE, DIMMED, LIGHT_BLUE, TITLE, WARNING, complete
 from websockets import Headers, Response
+
+from avatar_ros.ui.server.index_page import BLUE, DIMMED, LIGHT_BLUE, TITLE, WARNING, complete
 
 LEAST = 4.5  # contrast of text (WCAG 2.1, 1.4.3)
 WHITE, NIGHT = "#ffffff", "#242424"  # backgrounds of viser's panel, light and dark

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from avatar_interfaces.msg import LoopStatistics
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.ui.view.organ import Organ
-
-from avatar_ros.msg import LoopStatistics
 from tests.ros.conftest import Probe
 from tests.ros.helpers.browser import (
     beside_pose,

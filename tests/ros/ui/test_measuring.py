@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from avatar_core.geometry.tip import Tip
 from avatar_ros.ui.measure.measures import PLANE, TOOL, Measures
 from avatar_ros.ui.measure.measures_view import MeasuresView
 from avatar_ros.ui.session.presets import material_text
 from avatar_ros.ui.view.measuring import Place, depth, gap, hit, is_plane, margin
 from avatar_ros.ui.view.organ import Organ
-
-from avatar_core.geometry.tip import Tip
 from tests.helpers.box_organ import UP
 from tests.helpers.small_files import ball
 from tests.ros.helpers.page import Noted

@@ -7,6 +7,8 @@ from pathlib import Path
 import meshio
 import numpy as np
 import pytest
+
+from avatar_core.geometry.surface import read_surface
 from avatar_ros.ui.view.orientation import (
     AXES,
     FOV,
@@ -19,8 +21,6 @@ from avatar_ros.ui.view.orientation import (
     seen_letters,
     standard_view,
 )
-
-from avatar_core.geometry.surface import read_surface
 from tests.helpers.small_files import ball
 
 # directions of a file's axes, as a rotation from RAS

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import viser
 import zstandard
+from websockets.sync.client import ClientConnection, connect
+
 from avatar_ros.ui.server import pacing
 from avatar_ros.ui.server.guard import Guard, guarded
 from avatar_ros.ui.server.pacing import Pacing, paced
-from websockets.sync.client import ClientConnection, connect
-
 from tests.ros.helpers.browser import TOKEN, free_port
 
 

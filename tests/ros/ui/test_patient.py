@@ -9,6 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from viser import ViserServer
+
+from avatar_core.common.supports import ATTACHMENTS
+from avatar_core.geometry.groups import faces_of_groups, read_groups, regions_of_groups
+from avatar_core.offline.supports import SupportOption
 from avatar_ros.framework.conversions import surface_mesh
 from avatar_ros.patients.protocol import ACCESSIBLE, CLAMPED, FIRST_SPRING, stem
 from avatar_ros.ui.patient.new_patient import NewPatient
@@ -18,11 +23,6 @@ from avatar_ros.ui.tabs.inside import InsideTab
 from avatar_ros.ui.tabs.patient import FREE, GUESS, INSIDE, ORGAN, SPRUNG, PatientTab
 from avatar_ros.ui.view.organ import Organ
 from avatar_ros.ui.view.structures_view import STRUCTURE
-from viser import ViserServer
-
-from avatar_core.common.supports import ATTACHMENTS
-from avatar_core.geometry.groups import faces_of_groups, read_groups, regions_of_groups
-from avatar_core.offline.supports import SupportOption
 from tests.helpers.slowness import Deadline
 from tests.ros.helpers.page import AtOnce, Noted, face_area, image
 

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.ui.view.colours import N_BANDS, TISSUE, band_colours
-from avatar_ros.ui.view.organ import Organ
-from avatar_ros.ui.view.view import CUT, GLASS, OrganView
 from viser import ViserServer
 
 from avatar_core.geometry.tip import Tip
+from avatar_ros.ui.view.colours import N_BANDS, TISSUE, band_colours
+from avatar_ros.ui.view.organ import Organ
+from avatar_ros.ui.view.view import CUT, GLASS, OrganView
 from tests.ros.helpers.browser import browsing, close_notices, first_pose, screen_of
 
 pytestmark = pytest.mark.long

@@ -11,6 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
+
+from avatar_core.errors import StorageError
+from avatar_core.geometry.cut_surface import CutSurface
+from avatar_core.geometry.surface_files import parse
 from avatar_ros.ui.plan.bookmarks import Bookmark, Bookmarks
 from avatar_ros.ui.plan.plan import Plan, PlanNow
 from avatar_ros.ui.plan.report_pdf import report_pdf
@@ -19,11 +24,6 @@ from avatar_ros.ui.tools import history
 from avatar_ros.ui.tools.history import History
 from avatar_ros.ui.view.legend import DISPLACEMENT, EXPECTED_ERROR, SPREAD
 from avatar_ros.ui.view.organ import Organ
-from PIL import Image
-
-from avatar_core.errors import StorageError
-from avatar_core.geometry.cut_surface import CutSurface
-from avatar_core.geometry.surface_files import parse
 from tests.ros.helpers.page import Noted
 
 KEPT = Bookmark(

@@ -9,6 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from avatar_core.contact.layout import default_effects
+from avatar_core.geometry.tip import Tip
+from avatar_core.scene.file import read_scene, shipped_scene
+from avatar_core.scene.model import Scene, Tool
+from avatar_core.scene.recording import load_recording, save_recording
 from avatar_ros.ui.session.player import Player
 from avatar_ros.ui.session.presets import material_text
 from avatar_ros.ui.session.recorder import Recorder
@@ -18,12 +24,6 @@ from avatar_ros.ui.tools.history import History
 from avatar_ros.ui.tools.tool_state import N_ROWS, SharedToolState
 from avatar_ros.ui.tools.tools import Tools
 from avatar_ros.ui.view.organ import Organ
-
-from avatar_core.contact.layout import default_effects
-from avatar_core.geometry.tip import Tip
-from avatar_core.scene.file import read_scene, shipped_scene
-from avatar_core.scene.model import Scene, Tool
-from avatar_core.scene.recording import load_recording, save_recording
 from tests.ros.helpers.page import (
     NAMES,
     OK,

@@ -10,11 +10,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from avatar_ros.ui.session.alerts import alerts_of_switch
-from avatar_ros.ui.session.requests import Requests, Wanted
 from rclpy.action import ActionServer
 
-from avatar_ros.action import BuildPatient
+from avatar_interfaces.action import BuildPatient
+from avatar_ros.ui.session.alerts import alerts_of_switch
+from avatar_ros.ui.session.requests import Requests, Wanted
 from tests.ros.conftest import Probe
 from tests.ros.helpers.page import Noted
 

@@ -10,6 +10,12 @@ from typing import Any
 import nibabel
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from viser import ViserServer
+
+from avatar_core.common.hdf5 import replace_file
+from avatar_core.errors import SurfaceError
+from avatar_core.vademecum.storage import save_vademecum
 from avatar_ros.ui.scan.library import Library
 from avatar_ros.ui.scan.scan import read_scan, slice_of
 from avatar_ros.ui.scan.scan_view import ScanView
@@ -17,12 +23,6 @@ from avatar_ros.ui.tabs.scan import NONE, ScanTab
 from avatar_ros.ui.view.organ import Organ
 from avatar_ros.ui.view.orientation import AXES, basis, standard_view
 from avatar_ros.ui.view.surface_view import section
-from scipy.spatial.transform import Rotation
-from viser import ViserServer
-
-from avatar_core.common.hdf5 import replace_file
-from avatar_core.errors import SurfaceError
-from avatar_core.vademecum.storage import save_vademecum
 from tests.helpers.box_organ import organ
 from tests.helpers.small_files import ball
 from tests.ros.helpers.page import AtOnce, Noted, image

@@ -11,6 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from viser import ViserServer
+
+from avatar_core.vademecum.model import VademecumInfo
+from avatar_interfaces.msg import ContactState
 from avatar_ros.framework.templates import stamp_bytes
 from avatar_ros.loop.statuses import EXPLANATIONS, explanation
 from avatar_ros.nodes.planning_ui import PlanningNode
@@ -39,10 +43,6 @@ from avatar_ros.ui.session.texts import (
 from avatar_ros.ui.tabs.scene import SceneTab
 from avatar_ros.ui.tools.tool_state import N_RECENT, SharedToolState, organ_number
 from avatar_ros.ui.view.organ import Organ
-from viser import ViserServer
-
-from avatar_core.vademecum.model import VademecumInfo
-from avatar_ros.msg import ContactState
 from tests.ros.helpers.page import NAMES, OK, OUT, PLACES, TIP, Noted, rows, send
 
 # statuses of a period whose step computed no force, though the tool may press

@@ -11,13 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.bench.cell import Module
-from avatar_ros.bench.footprint import children
-from avatar_ros.framework import qos
-from avatar_ros.framework.discovery import stay_local
-from avatar_ros.ui.session.recorder import Recorder
-from avatar_ros.ui.tools.tool_driver import PeriodCollector
-from avatar_ros.ui.tools.tool_state import SharedToolState, ToolDriverProcess, organ_number
 from geometry_msgs.msg import PoseStamped
 
 from avatar_core.contact.tool_path import middle_of_access
@@ -26,7 +19,14 @@ from avatar_core.scene.file import read_scene, shipped_scene
 from avatar_core.scene.recording import load_recording
 from avatar_core.scene.replay import replay
 from avatar_core.vademecum.storage import load_vademecum
-from avatar_ros.srv import LoadScene
+from avatar_interfaces.srv import LoadScene
+from avatar_ros.bench.cell import Module
+from avatar_ros.bench.footprint import children
+from avatar_ros.framework import qos
+from avatar_ros.framework.discovery import stay_local
+from avatar_ros.ui.session.recorder import Recorder
+from avatar_ros.ui.tools.tool_driver import PeriodCollector
+from avatar_ros.ui.tools.tool_state import SharedToolState, ToolDriverProcess, organ_number
 from tests.helpers.slowness import Deadline, wait_until
 from tests.ros.conftest import PATIENT, START_TIMEOUT, Probe
 from tests.ros.helpers.page import NAMES, OK, PLACES

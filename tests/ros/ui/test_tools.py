@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from viser import ViserServer
+
 from avatar_ros.ui.session.shown_period import ShownPeriod
 from avatar_ros.ui.session.texts import BAND
 from avatar_ros.ui.tabs.tool import KEYS, ToolTab
@@ -17,8 +19,6 @@ from avatar_ros.ui.tools.tools import OVER, Tools
 from avatar_ros.ui.tools.way import way_around
 from avatar_ros.ui.view.organ import Organ
 from avatar_ros.ui.view.orientation import AXES
-from viser import ViserServer
-
 from tests.helpers.box_organ import UP as UP_OF_BOX
 from tests.ros.helpers.page import NAMES, PLACES, UP, Noted
 

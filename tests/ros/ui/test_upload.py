@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from avatar_ros.framework.reader import Reader
-from avatar_ros.ui.scan import upload
-from avatar_ros.ui.server.index_page import MOST_SENT
 from viser import UploadedFile, ViserServer
 
 from avatar_core.errors import AvatarError
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+from avatar_ros.framework.reader import Reader
+from avatar_ros.ui.scan import upload
+from avatar_ros.ui.server.index_page import MOST_SENT
 from tests.helpers.box_organ import organ
 from tests.ros.helpers.page import Noted, image
 

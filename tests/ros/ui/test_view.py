@@ -8,6 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from viser import ViserServer
+
+from avatar_core.contact.model import ContactData
+from avatar_core.fem.supports import Support
+from avatar_core.geometry.tip import Tip
+from avatar_core.vademecum.display import boundary, display_of
+from avatar_core.vademecum.model import Vademecum
 from avatar_ros.ui.view import tone
 from avatar_ros.ui.view.colours import HELD, N_BANDS, N_SHADES, TISSUE
 from avatar_ros.ui.view.cut_handle import CutHandle
@@ -18,13 +25,6 @@ from avatar_ros.ui.view.surface_view import N_TONES
 from avatar_ros.ui.view.tip_body import tip_body, turn_to
 from avatar_ros.ui.view.tool_view import ToolView
 from avatar_ros.ui.view.view import CUT, GLASS, HIDDEN, WHOLE, OrganView
-from viser import ViserServer
-
-from avatar_core.contact.model import ContactData
-from avatar_core.fem.supports import Support
-from avatar_core.geometry.tip import Tip
-from avatar_core.vademecum.display import boundary, display_of
-from avatar_core.vademecum.model import Vademecum
 from tests.helpers.box_organ import UP, organ, top
 from tests.helpers.contact import prepare, step
 from tests.helpers.shown_dent import finer
