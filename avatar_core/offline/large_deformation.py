@@ -77,9 +77,7 @@ class LargeRule:
 
 @dataclass(frozen=True, eq=False)
 class _Paths:
-    """Terms of all load positions.
-
-    Pushes, then pulls.
+    """Terms of all load positions, first for pushes, then for pulls.
 
     fields : ndarray float32, shape (2, 2, n_positions, 3 n_vertices), V_k [m^(1-k)]
     depth : ndarray, shape (2, 2, n_positions), beta_k; reach : (2, n_positions), a_max [m]

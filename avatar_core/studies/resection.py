@@ -59,7 +59,10 @@ class ResectionStudy(Study[ResectionSettings]):
     quick = ResectionSettings(1000, (0.1, 0.5), 24)
 
     def measure(self, run: Run[ResectionSettings]) -> None:
-        surfaces = (phantom_liver(), read_liver(run.surfaces, "LiTS-4"))
+        surfaces = [phantom_liver(), read_liver(run.surfaces, "LiTS-4")]
+        if surfaces[1].name == surfaces[0].name:
+            run.notices.append("no folder of livers (--surfaces): the phantom alone")
+            del surfaces[1]
         with ProgressBar(len(surfaces)) as bar:
             for surface in surfaces:
                 progress = bar.begin(surface.name)

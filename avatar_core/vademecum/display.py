@@ -123,24 +123,40 @@ def _on_boundary(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _split(
     mesh: TetMesh, organ: Triangles, tied: tuple[np.ndarray, np.ndarray]
 ) -> tuple[Triangles, tuple[np.ndarray, np.ndarray]]:
-    """Part a surface that a cut crosses: each triangle hangs on the tissue of one side alone.
+    """Part a surface where a cut crosses it: each triangle hangs on the tissue of one side.
 
-    Triangles with vertices on both sides go to the first; their vertices on the second are doubled.
+    Triangles with corners on both sides are divided at the cut, and the points there are doubled.
     """
     (points, faces), (corners, weights) = organ, tied
     second = np.zeros(len(mesh.vertices), bool)
     second[mesh.tets[mesh.is_second_side]] = True
-    is_second = second[corners[:, 0]]
-    across = is_second[faces].any(axis=1) & ~is_second[faces].all(axis=1)
-    moved = is_second[faces] & across[:, None]
-    doubled, number = np.unique(faces[moved], return_inverse=True)
-    faces = faces.copy()
-    faces[moved] = len(points) + number
-    first = mesh.boundary_faces[~second[mesh.boundary_faces[:, 0]]]
-    _, face, on_face = closest_points(mesh.vertices, first, points[doubled])
-    corners = np.concatenate([corners, first[face][:, [0, 1, 2, 0]]])
-    weights = np.concatenate([weights, np.pad(on_face, ((0, 0), (0, 1)))])
-    return (np.concatenate([points, points[doubled]]), faces), (corners, weights)
+    side = second[corners[:, 0]].astype(int)
+    crossed = np.ptp(side[faces], axis=1) > 0
+    across = faces[crossed]
+    count = side[across].sum(axis=1, keepdims=True)
+    alone = np.argmax(side[across] == (count == 1), axis=1)  # the corner that has no other beside
+    a, b, c = np.take_along_axis(across, (alone[:, None] + np.arange(3)) % 3, axis=1).T
+    edges = np.concatenate([np.stack([a, b], axis=1), np.stack([a, c], axis=1)])
+    edges, number = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
+    nearest, _, _ = closest_points(mesh.vertices, mesh.cut_faces[0], points[edges.ravel()])
+    off = np.linalg.norm(points[edges.ravel()] - nearest, axis=1).reshape(-1, 2) + 1e-9
+    met = np.einsum("ek,ekd->ed", off[:, ::-1] / off.sum(axis=1, keepdims=True), points[edges])
+    own, other = (len(points) + len(met) * k for k in (side[a], 1 - side[a]))
+    p, q = number.reshape(2, -1)
+    faces = np.concatenate(
+        [
+            faces[~crossed],
+            np.stack([a, p + own, q + own], axis=1),
+            np.stack([p + other, b, c], axis=1),
+            np.stack([p + other, c, q + other], axis=1),
+        ]
+    )
+    for is_second in (False, True):
+        beside = mesh.boundary_faces[second[mesh.boundary_faces[:, 0]] == is_second]
+        _, face, on_face = closest_points(mesh.vertices, beside, met)
+        corners = np.concatenate([corners, beside[face][:, [0, 1, 2, 0]]])
+        weights = np.concatenate([weights, np.pad(on_face, ((0, 0), (0, 1)))])
+    return (np.concatenate([points, met, met]), faces), (corners, weights)
 
 
 def blocks_to_display(mesh: TetMesh, display: Display | None) -> Blocks:

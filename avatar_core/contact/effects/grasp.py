@@ -289,17 +289,18 @@ def write_held_force(model, data, t, n):  # type: ignore[no-untyped-def]
 
 @inlined
 def linearly_moved(model, data, t):  # type: ignore[no-untyped-def]
-    """Displacement of a held tool to which the law responds linearly [m].
+    """Compute the displacement by a held tool's own force that the law takes as linear [m].
 
     With large deformation, what the patch moves along the normal is not counted.
     """
-    y, n, patch = data.friction.offset[t], data.normal[t], 0.0
+    g, n, c = data.friction.push[t], data.normal[t], data.friction.compliance[t, t]
+    patch = square = 0.0
     if model.large_deformation.on:
-        g, own = data.friction.push[t], data.self_compliance[t] - data.law.value[t, TAKEN]
-        patch = own * (g[0] * n[0] + g[1] * n[1] + g[2] * n[2]) - data.grasp.bent[t, 0]
-    square = 0.0
+        own = data.self_compliance[t] - data.law.value[t, TAKEN]
+        patch = own * (g[0] * n[0] + g[1] * n[1] + g[2] * n[2])
     for d in range(3):
-        square += (y[d] - patch * n[d]) ** 2
+        moved = c[d, 0] * g[0] + c[d, 1] * g[1] + c[d, 2] * g[2] - patch * n[d]
+        square += moved * moved
     return np.sqrt(square)
 
 

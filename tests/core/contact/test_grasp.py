@@ -239,14 +239,12 @@ def test_a_jaw_beyond_reach_or_closed_before_holds_nothing() -> None:
     assert not data.holds(0) and data.out.status[0] == Status.OK
 
 
-def test_tissue_that_hangs_is_taken_where_it_hangs() -> None:
-    """Closed on the sagged surface, it takes the point that has come there, and pulls nothing."""
-    effects = (Grasp(), SelfWeight(gravity=9.81))
-    data, _ = holding(middle(), effects=effects)
+def holding_what_hangs(gravity: float) -> tuple[ContactData, np.ndarray, np.ndarray]:
+    """A tool that has closed its jaw on the sagged surface, where it is, and the sag there [m]."""
+    data, _ = holding(middle(), effects=(Grasp(), SelfWeight(gravity=gravity)))
     cloud = data.out.cloud
     vertex = np.argmin(np.linalg.norm(cloud[:, :3] - cloud[:, 3:] - middle().center, axis=1))
     sag = cloud[vertex, 3:].astype(float)
-    assert np.linalg.norm(sag) > 1e-3
     data.reset()
     at = (middle().tip(-ABOVE) + sag)[None]
     for _ in range(2):
@@ -254,10 +252,27 @@ def test_tissue_that_hangs_is_taken_where_it_hangs() -> None:
     step(data.model, data, at, None, SHUT)
     assert data.holds(0)
     assert np.linalg.norm(data.out.force[0]) < 1e-9
+    return data, at, sag
+
+
+def test_tissue_that_hangs_is_taken_where_it_hangs() -> None:
+    """Closed on the sagged surface, it takes the point that has come there, and pulls nothing."""
+    data, at, sag = holding_what_hangs(9.81)
+    assert np.linalg.norm(sag) > 1e-3
     taken = data.state.point[0] - middle().center
     assert np.linalg.norm(taken) < 0.3 * np.linalg.norm(sag)
     step(data.model, data, at + np.array([[0.0, 2e-3, 0.0]]))
     assert data.out.force[0, 1] < -0.1
+
+
+def test_a_sag_is_no_pull_beyond_the_range() -> None:
+    """Tissue that hangs by more than the range of a pull is held like tissue at rest."""
+    data, at, sag = holding_what_hangs(30.0)
+    assert np.linalg.norm(sag) > FARTHEST
+    assert data.out.status[0] == Status.OK
+    pull = 0.9 * FARTHEST * data.state.normal[0]
+    assert step(data.model, data, at + pull) == Status.OK
+    assert step(data.model, data, at + pull / 0.8) == Status.EXTRAPOLATED
 
 
 def test_what_is_held_moves_with_the_jaw_on_the_screen() -> None:
