@@ -1,7 +1,8 @@
 """Errors of a vademecum with large deformation on unseen pushes and pulls.
 
-The truth is the full nonlinear finite element solution on the same mesh, by Newton's method, for
-patches centred at face centroids, moved along the normal to depths that the build does not use.
+The reference is the full nonlinear finite element solution on the same mesh, by Newton's method.
+Patches are centred at face centroids, and moved along the normal to depths that the build does not
+use.
 """
 
 from __future__ import annotations
@@ -28,10 +29,12 @@ _PUSHES_PER_PULL = 3
 class LargeRow:
     """One push or pull: errors at equal depth.
 
-    triangle : accessible face whose centroid is pushed; depth : inward, negative of a pull [m]
-    l2 : |u - u_FE| / |u_FE|, mass-weighted; contact : |F / F_FE - 1|
-    linear_l2, linear_contact : the same of the linear vademecum
-    within : the push lies in the stored range
+    triangle : accessible face whose centroid is pushed
+    depth : inward depth, negative for a pull [m]
+    l2 : |u - u_FE| / |u_FE|, mass-weighted
+    contact : |F / F_FE - 1|
+    linear_l2, linear_contact : the same errors of the linear vademecum
+    within : whether the push lies in the stored range
     """
 
     triangle: int
@@ -51,12 +54,12 @@ def certify_large(
     seed: int = 0,
     progress: Callable[[float, float], None] = lambda fraction, error: None,
 ) -> tuple[LargeCertificate, tuple[LargeRow, ...]]:
-    """Push at random centroids to the depths 1/4, 1/2, 3/4 and 1 of what is stored there.
+    """Push at random centroids to the depths 1/4, 1/2, 3/4 and 1 of the stored range there.
 
     Each third of them is pulled as far too. Random factors of 0.9 to 1 keep the depths from being
     round.
 
-    progress : called with the fraction that is done and the mean error so far
+    progress : called with the finished fraction and the mean error so far
     """
     surface = vademecum.surface
     rng = np.random.default_rng(seed)
@@ -84,7 +87,7 @@ def certify_large(
 def with_combinations(
     certificate: LargeCertificate, rows: Sequence[CombinedRow]
 ) -> LargeCertificate:
-    """The certificate with the figures of pushes together with other effects."""
+    """Return the certificate with the figures of pushes together with other effects."""
     return replace(
         certificate,
         oblique_contact_mean=mean_error(rows, "oblique"),
@@ -101,10 +104,10 @@ def push_rows(
     barycentric: tuple[float, float, float] = (1 / 3, 1 / 3, 1 / 3),
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> tuple[list[LargeRow], bool]:
-    """Errors at a point of one face; whether equilibrium was lost within the stored range.
+    """Return errors at a point of one face, and whether equilibrium was lost in the stored range.
 
     depths : all inward, or all negative [m]
-    barycentric : of the point; the centroid by default
+    barycentric : place of the point; the centroid by default
     progress : called with the fraction of the last depth that is reached
     """
     surface = vademecum.surface
@@ -143,7 +146,7 @@ def push_rows(
 def summary(
     vademecum: Vademecum, rows: list[LargeRow], n_sites: int, n_lost: int
 ) -> LargeCertificate:
-    """Means and worst over the pushes and pulls within the stored range."""
+    """Return means and worst over the pushes and pulls within the stored range."""
     assert vademecum.large is not None
     inside = [row for row in rows if row.within and row.depth > 0.0]
     pulled = [row for row in rows if row.within and row.depth < 0.0]

@@ -24,6 +24,7 @@ class Status(IntEnum):
     meaning: str
 
     def __new__(cls, number: int, meaning: str) -> Status:
+        """Return a status with its number and meaning."""
         status = int.__new__(cls, number)
         status._value_, status.meaning = number, meaning
         return status

@@ -1,15 +1,15 @@
 """A cut through an organ whose sides springs tie together, released strip by strip.
 
 Between the two sides the traction is t = -k [u], with the jump [u] of the displacement and a
-stiffness per area k [N/m^3]. The weak form gains int_cut k [u].[v] da. The cut is divided along
-the direction in which it opens into strips of equal area, each a term that is affine in its own k.
-The coordinate r from 0 (whole) to 1 (opened as far as asked) releases one strip after the other:
+stiffness per area k [N/m^3]. The weak form gains int_cut k [u].[v] da. The cut is divided along the
+direction in which it opens into strips of equal area, each a term that is affine in its own k. The
+coordinate r from 0 (whole) to 1 (opened as far as asked) releases one strip after the other:
 
     k_j(r) = k_h (1 - t) / (t + k_h / k),    t = clip(n r - j, 0, 1),   j = 0 ... n - 1,
 
 from k to nothing. An organ gives way like 1 / (k_j + k_o), with a k_o that its size and Young's
 modulus set. With k_h = k_o the displacement would grow evenly with t. A k_h below k_o keeps the
-values near k_o, where interpolation is worst, within the first tenth of each strip.
+values near k_o within the first tenth of each strip. Interpolation is worst near k_o.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from avatar_core.geometry.mesh import TetMesh
 TIE = 1e9  # per area of the cut [N/m^3]
 N_STRIPS = 5  # one between each two of the six stored values
 # k_h over Young's modulus [1/m]. For loads at load positions of LiTS-4 (1,000 vertices), halfway
-# through a strip, the error is 1.3 % in the mean and 5 % at worst. With 18, and with k_j falling
+# through a strip, the mean error is 1.3 % and the worst 5 %. With 18, and with k_j falling
 # evenly in log k, it is 2.0 and 10 %. A tenth through a strip it is 2.3 and 11 % with 2.5.
 _HALFWAY = 2.5
 _SIDES = {"first": "off", "second": "on"}
@@ -39,13 +39,20 @@ _PIECES = 4  # of a face's edge, for the quadrature: fronts cut faces
 
 @dataclass(frozen=True)
 class Resection:
-    """How far a cut is opened.
+    """Opening of a cut.
 
-    direction : unit vector in which it opens
-    fronts : limits of the strips, positions along the direction, ascending [m]
-    opened : coordinate r, 0 (whole) to 1 (opened as far as asked)
-    stiffness : k of the tie, per area [N/m^3]
-    halfway : k_h, about that of a strip which is half released [N/m^3]
+    Attributes
+    ----------
+    direction : tuple[float, float, float]
+        Unit vector in which it opens.
+    fronts : tuple[float, ...]
+        Limits of the strips, positions along the direction, ascending [m].
+    opened : float
+        Coordinate r, 0 (whole) to 1 (opened as far as asked).
+    stiffness : float
+        k of the tie, per area [N/m^3].
+    halfway : float
+        k_h, near the stiffness of a half released strip [N/m^3].
 
     Raises
     ------
@@ -69,9 +76,9 @@ class Resection:
 
     @classmethod
     def of(cls, mesh: TetMesh, surface: CutSurface, young_modulus: float) -> Resection:
-        """The whole organ, to be opened along a surface that its mesh is cut along.
+        """Return the whole organ, to be opened along a surface that its mesh is cut along.
 
-        young_modulus : of the organ [Pa]
+        young_modulus : Young's modulus of the organ [Pa]
         """
         points, weight = _quadrature(mesh)
         along = points.reshape(-1, 3) @ surface.direction
@@ -87,7 +94,7 @@ class Resection:
 
     @property
     def factors(self) -> FloatArray:
-        """Stiffness per area of each strip, then of what stays tied, (n_strips + 1,) [N/m^3]."""
+        """Stiffness per area of each strip, then of the tied rest, (n_strips + 1,) [N/m^3]."""
         n = len(self.fronts) - 1
         t = np.clip(n * self.opened - np.arange(n), 0.0, 1.0)
         left = self.halfway * (1.0 - t) / (t + self.halfway / self.stiffness)
@@ -96,9 +103,11 @@ class Resection:
     def jump_mass(
         self, mesh: TetMesh, nodes: np.ndarray, n_nodes: int
     ) -> tuple[sp.csr_matrix, ...]:
-        """int [u].[v] da over each strip and over what stays tied, (3 n_nodes, 3 n_nodes) [m^2].
+        """Return int [u].[v] da over each strip and over the tied rest.
 
-        nodes : of both sides' faces, shape (2, n_faces, 3 or 6)
+        Shapes (3 n_nodes, 3 n_nodes) [m^2].
+
+        nodes : nodes of both sides' faces, shape (2, n_faces, 3 or 6)
         """
         points, weight = _quadrature(mesh)
         barycentric, _ = subdivided_rule(_PIECES)
@@ -121,13 +130,13 @@ class Resection:
         return tuple(masses)
 
     def _strip(self, points: FloatArray) -> np.ndarray:
-        """Number of the strip that points lie in; the last is what stays tied."""
+        """Return the number of the strip that points lie in; the last is the tied rest."""
         found = np.searchsorted(self.fronts[1:], points @ np.array(self.direction), side="left")
         return np.asarray(found)
 
 
 def opened_to(resection: Resection | None, value: float | None) -> Resection | None:
-    """A resection at another value of its coordinate; None for either changes nothing."""
+    """Return a resection at another value of its coordinate; None for either changes nothing."""
     if resection is None or value is None:
         return resection
     return replace(resection, opened=value)
@@ -142,15 +151,15 @@ def require_parts_held(
 ) -> None:
     """Refuse a cut that leaves a part of the organ free to move as a rigid body.
 
-    A part is held by a clamp, by its supports, or by these and what stays tied of the cut to a
-    part that is held without it.
+    A part is held by a clamp or by its supports. It may also be held by these and the tied rest of
+    the cut, if the other part is held without it.
 
     clamped : ndarray of bool, shape (n_faces,)
 
     Raises
     ------
     MaterialError
-        Naming the part that is loose, its volume and where it lies.
+        Naming the loose part, its volume and its place.
     """
     piece, whole = mesh.pieces[mesh.boundary_tets], np.ones(len(mesh.boundary_faces), bool)
     if resection.opened == 0.0 and not clamped.any():
@@ -188,20 +197,20 @@ def _is_held(
     springs: tuple[FloatArray, FloatArray],
     young_modulus: float,
 ) -> bool:
-    """Whether supports and further springs (points [m], stiffnesses [N/m]) hold a part."""
+    """Return whether supports and further springs (points [m], stiffnesses [N/m]) hold a part."""
     least = least_resisted(mesh, supports, part, springs)
     length = float(np.ptp(mesh.vertices[mesh.boundary_faces[part]], axis=(0, 1)).max())
     return least.holds(length, young_modulus)
 
 
 def _tie_springs(mesh: TetMesh, resection: Resection) -> tuple[FloatArray, FloatArray]:
-    """Points of the cut (n_faces, n_points, 3) [m] and the tie's stiffness there [N/m]."""
+    """Return points of the cut (n_faces, n_points, 3) [m] and the tie's stiffness there [N/m]."""
     points, weight = _quadrature(mesh)
     return points, weight * resection.factors[resection._strip(points)]
 
 
 def _quadrature(mesh: TetMesh) -> tuple[FloatArray, FloatArray]:
-    """Points on the cut's faces (n_faces, n_points, 3) [m] and their weights [m^2]."""
+    """Return points on the cut's faces (n_faces, n_points, 3) [m] and their weights [m^2]."""
     corners = mesh.vertices[mesh.cut_faces[0]]
     barycentric, weight = subdivided_rule(_PIECES)
     a, b, c = corners.swapaxes(0, 1)

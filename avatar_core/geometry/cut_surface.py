@@ -5,8 +5,8 @@ A file is JSON, in metres and the axes of the vademecum (RAS):
     {"point": [x, y, z], "normal": [x, y, z], "open_along": [x, y, z], "part": 0.8}
     {"bezier": [[x, y, z], ... 16 points, row by row], "open_along": [x, y, z]}
 
-``open_along`` is the direction in which the cut opens, from one edge of the organ inward; ``part``
-of the cut's area is opened at most (all of it by default).
+``open_along`` is the direction in which the cut opens, from one edge of the organ inward. ``part``
+is the largest opened fraction of the cut's area (all of it by default).
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class CutSurface:
-    """A surface that divides space, and how a cut along it opens.
+    """A surface that divides space, and the opening of a cut along it.
 
-    Parameters
+    Attributes
     ----------
-    open_along : tuple of float
+    open_along : Triple
         Direction in which the cut opens.
-    point, normal : tuple of float or None
-        A point of a plane [m], and its normal.
-    bezier : tuple or None
-        Bezier surface instead of a plane: 16 control points, row by row [m]. It goes on straight
-        beyond its edges.
+    point, normal : Triple or None
+        Point [m] and normal of a plane.
+    bezier : tuple[Triple, ...] or None
+        16 control points, row by row, instead of a plane [m]; the surface goes on straight beyond
+        its edges.
     part : float
-        Largest part of the cut's area that opens.
+        Largest opened fraction of the cut's area.
 
     Raises
     ------
@@ -83,7 +83,7 @@ class CutSurface:
 
     @classmethod
     def read(cls, path: Path) -> CutSurface:
-        """The surface of a file.
+        """Read the surface of a file.
 
         Raises
         ------
@@ -119,7 +119,7 @@ class CutSurface:
         return np.asarray(along / np.linalg.norm(along))
 
     def offsets(self, points: FloatArray) -> FloatArray:
-        """Vectors from points to the surface, shape (n, 3) [m]."""
+        """Return vectors from points to the surface, shape (n, 3) [m]."""
         if self.bezier is None:
             height = (points - np.array(self.point)) @ self.mean_normal
             return np.asarray(-height[:, None] * self.mean_normal)
@@ -127,7 +127,7 @@ class CutSurface:
         return np.asarray(closest - points)
 
     def heights(self, points: FloatArray) -> FloatArray:
-        """Signed distances of points, above zero on the side of the normal, shape (n,) [m]."""
+        """Return signed distances of points, above zero on the normal's side, shape (n,) [m]."""
         if self.bezier is None:
             return np.asarray((points - np.array(self.point)) @ self.mean_normal)
         vertices, faces = self._triangles
@@ -138,7 +138,7 @@ class CutSurface:
 
     @cached_property
     def _triangles(self) -> tuple[FloatArray, np.ndarray]:
-        """A Bezier surface, with what goes on beyond its edges."""
+        """A Bezier surface, continued beyond its edges."""
         inside = np.linspace(0.0, 1.0, _SAMPLES)
         at = np.concatenate([[-_BEYOND], inside, [1.0 + _BEYOND]])
         shape = _bernstein(at)
@@ -152,7 +152,7 @@ class CutSurface:
 
 
 def _bernstein(at: FloatArray) -> FloatArray:
-    """Cubic Bernstein polynomials, straight lines beyond 0 and 1, shape (n, 4)."""
+    """Return cubic Bernstein polynomials, straight lines beyond 0 and 1, shape (n, 4)."""
     t, order = np.clip(at, 0.0, 1.0)[:, None], np.arange(_CONTROL)
     degree = _CONTROL - 1
 

@@ -1,8 +1,8 @@
 """An organ's mesh, cut along a surface into two sides whose faces lie on one another.
 
 The nearer end of every edge that crosses the surface is moved onto it, if the elements around stay
-good. Vertices of the organ's boundary move along the boundary. Elements then belong to the side
-that most of them lies on. Vertices between the sides are moved on as far as they can, and are
+good. Vertices of the organ's boundary move along the boundary. An element then belongs to the side
+on which most of it lies. Vertices between the sides are moved on as far as they can, and are
 doubled: the first side keeps their numbers.
 """
 
@@ -18,17 +18,18 @@ from avatar_core.geometry.mesh import TetMesh, components
 _LEAST_PART = 0.01  # of the organ's volume; less is no part but a rim that the surface grazes
 _WAYS = (1.0, 0.5, 0.25)  # of a vertex to the surface, that are tried
 _SWEEPS = 3
-_LEAST_SHAPE = 0.25  # of an element, over what it was: below, its vertices stay
+_LEAST_SHAPE = 0.25  # least shape of an element over its original one; below, its vertices stay
 _STEEP = 0.5  # sine between normal of the organ and of the cut, below which a vertex stays
 
 
 def snapped(mesh: TetMesh, surface: CutSurface) -> tuple[TetMesh, np.ndarray]:
-    """The mesh with the vertices between both sides moved onto the surface, and its sides.
+    """Move the vertices between both sides onto the surface; return the mesh and its sides.
 
     Returns
     -------
     mesh : TetMesh
-    second : ndarray of bool, shape (n_tets,), elements on the side of the surface's normal
+    second : ndarray of bool, shape (n_tets,)
+        Elements on the side of the surface's normal.
 
     Raises
     ------
@@ -54,9 +55,9 @@ def snapped(mesh: TetMesh, surface: CutSurface) -> tuple[TetMesh, np.ndarray]:
 
 
 def cut(mesh: TetMesh, second: np.ndarray) -> TetMesh:
-    """The mesh with doubled vertices between its sides.
+    """Return the mesh with doubled vertices between its sides.
 
-    second : ndarray of bool, shape (n_tets,), as of :func:`snapped`
+    second : ndarray of bool, shape (n_tets,), see :func:`snapped`
     """
     between = np.intersect1d(mesh.tets[second], mesh.tets[~second])
     number = np.arange(len(mesh.vertices))
@@ -68,7 +69,7 @@ def cut(mesh: TetMesh, second: np.ndarray) -> TetMesh:
 
 
 def _nearer_ends(mesh: TetMesh, height: FloatArray) -> np.ndarray:
-    """The vertices that are nearer to the surface, of the edges that cross it."""
+    """Return the nearer end of each edge that crosses the surface."""
     first, second = np.triu_indices(4, 1)
     ends = mesh.tets[:, np.stack([first, second], axis=1)].reshape(-1, 2)
     ends = ends[height[ends[:, 0]] * height[ends[:, 1]] < 0.0]
@@ -79,7 +80,7 @@ def _nearer_ends(mesh: TetMesh, height: FloatArray) -> np.ndarray:
 class _Moving:
     """Vertices of a mesh that move onto a surface, one after the other.
 
-    points : ndarray, shape (n_vertices, 3), where they are [m]
+    points : ndarray, shape (n_vertices, 3), their present places [m]
     """
 
     def __init__(self, mesh: TetMesh, surface: CutSurface) -> None:
@@ -91,7 +92,7 @@ class _Moving:
         self._tets = around // 4
 
     def move(self, vertices: np.ndarray, ways: tuple[float, ...]) -> None:
-        """Move each as far as the elements around it allow, of some parts of its way."""
+        """Move each vertex by the first fraction of its way that keeps its elements good."""
         offset = self._surface.offsets(self.points[vertices])
         offset = _along_boundary(offset, self._mesh.vertex_normals[vertices])
         for vertex, way in zip(vertices, offset, strict=True):
@@ -105,7 +106,7 @@ class _Moving:
 
 
 def _along_boundary(offset: FloatArray, outward: FloatArray) -> FloatArray:
-    """Offsets to a surface, of vertices of the boundary turned into its tangent plane, (n, 3)."""
+    """Return offsets of boundary vertices to a surface, turned into the tangent plane, (n, 3)."""
     length = np.linalg.norm(offset, axis=1, keepdims=True)
     way = np.divide(offset, length, out=np.zeros_like(offset), where=length > 0.0)
     tangent = way - np.einsum("nd,nd->n", way, outward)[:, None] * outward
@@ -115,7 +116,7 @@ def _along_boundary(offset: FloatArray, outward: FloatArray) -> FloatArray:
 
 
 def _shapes(points: FloatArray, tets: np.ndarray) -> FloatArray:
-    """Volume over the cube of the root mean square edge of elements, shape (n_tets,)."""
+    """Return volume over the cube of the root mean square edge of elements, shape (n_tets,)."""
     corners = points[tets]
     first, second = np.triu_indices(4, 1)
     square = ((corners[:, first] - corners[:, second]) ** 2).sum(axis=2).mean(axis=1)
@@ -127,7 +128,7 @@ def _text(point: FloatArray) -> str:
 
 
 def _without_islands(mesh: TetMesh, second: np.ndarray) -> np.ndarray:
-    """The sides, with pieces below a hundredth of the organ given to the other side."""
+    """Return the sides; pieces below a hundredth of the organ change to the other side."""
     out = second.copy()
     for side in (second, ~second):
         own = np.flatnonzero(side)

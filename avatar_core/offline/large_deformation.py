@@ -1,17 +1,16 @@
 """Offline stage of large deformation: the series of every load position, in two terms.
 
-Every load position gets its own terms, from a linear solution each with the stiffness at rest:
-there are no training sites to choose and nothing to interpolate but what the linear vademecum
-interpolates too. The terms of a pull are those of the push with the sign of odd orders turned.
-Terms of fourth and fifth order are *economised*: within the reach A they are replaced by the two
-that are kept,
+Every load position gets its own terms, from a linear solution each with the stiffness at rest.
+There are no training sites to choose, and only the linear vademecum's interpolation is needed. The
+terms of a pull are those of the push with the sign of odd orders turned. Terms of fourth and fifth
+order are *economised*: within the reach A they are replaced by the two that are kept,
 
     x^4 ~ -0.431 x^2 + 1.392 x^3,   x^5 ~ -0.686 x^2 + 1.610 x^3,   x = a / A in [0, 1],
 
 to 3.8 and 7.5 % of A^4 and A^5, the least possible relative to x (Lanczos, Applied Analysis, 1956).
-The error of that, and an estimate of the terms never computed, determine the reach. (The residual
-K^-1 r is no measure: in nearly incompressible tissue the remaining rotation appears in it as a
-change of volume, 50 times too large.)
+This error, and an estimate of the terms never computed, determine the reach. (The residual K^-1 r
+is no measure. In nearly incompressible tissue the remaining rotation appears in it as a change of
+volume, 50 times too large.)
 """
 
 from __future__ import annotations
@@ -49,9 +48,9 @@ _SIGNS = np.stack([np.ones(_ORDER), (-1.0) ** np.arange(1, _ORDER + 1)])
 
 @dataclass(frozen=True)
 class LargeRule:
-    """How far and how well.
+    """Range and accuracy of large deformation.
 
-    Parameters
+    Attributes
     ----------
     max_push : float
         Depth aimed at [m].
@@ -60,11 +59,11 @@ class LargeRule:
     least_det : float
         Smallest det F at the reach, so that no element is inside out.
     least_stiffness : float
-        Smallest d(force)/d(depth), over that at rest.
+        Smallest d(force)/d(depth), over its value at rest.
     max_modes : int
         Largest number of modes of a region.
     mode_tolerance : float
-        Mean relative L2 error of the displacement that these modes leave at the reach.
+        Mean relative L2 error of these modes for the displacement at the reach.
     """
 
     max_push: float = 20e-3
@@ -97,13 +96,11 @@ def with_large_deformation(
     rule: LargeRule | None = None,
     progress: Progress = silent,
 ) -> Vademecum:
-    """A linear vademecum with the load's magnitude as a coordinate.
+    """Return a linear vademecum with the load's magnitude as a coordinate.
 
-    Parameters
-    ----------
+    If ``max_modes`` do not meet ``mode_tolerance``, a notice in the provenance says so.
+
     problem : Hyperelasticity on the vademecum's mesh, clamp and material
-
-    Where ``max_modes`` do not meet ``mode_tolerance``, a notice in the provenance says so.
     """
     rule = rule or LargeRule()
     paths = _follow(problem, vademecum.surface, rule, progress)
@@ -156,9 +153,10 @@ def _follow(
 
 
 def economised(terms: FloatArray, reach: float) -> FloatArray:
-    """The terms of second and third order that stand for all but the first, shape (2, ...).
+    """Return the terms of second and third order that replace all but the first, shape (2, ...).
 
-    terms : ndarray, shape (5, ...), by powers of a; reach : A [m]
+    terms : ndarray, shape (5, ...), by powers of a
+    reach : A [m]
     """
     scale = reach ** np.arange(4, _ORDER + 1)[:, None] / reach ** np.array(POWERS)
     return np.asarray(terms[1:3] + np.tensordot((scale * _ECONOMISED).T, terms[3:], axes=1))
@@ -167,9 +165,10 @@ def economised(terms: FloatArray, reach: float) -> FloatArray:
 def _reach(
     problem: Hyperelasticity, terms: FloatArray, beta: FloatArray, mass: FloatArray, rule: LargeRule
 ) -> tuple[float, float]:
-    """Largest linear depth up to ``max_push`` at which two terms do, and |u| there in L2.
+    """Return the largest linear depth up to ``max_push`` that two terms cover, and |u| there in L2.
 
-    terms : ndarray, shape (5, 3 n_nodes); beta : shape (5,), their inward depth of the patch
+    terms : ndarray, shape (5, 3 n_nodes)
+    beta : ndarray, shape (5,), their inward depth of the patch
     """
     beta = np.sign(beta[0]) * beta
     at_vertices = terms[:, : len(mass)]
@@ -187,10 +186,12 @@ def _reach(
 
 
 def _left(size: FloatArray) -> FloatArray:
-    """Relative error of two terms, from the sizes of all five at n reaches, shape (n, 5): (n,).
+    """Return the relative error of two terms, shape (n,).
 
-    Terms never computed count as the sixth, in proportion to the last two: on a real liver, within
-    a factor of three of the truth up to 20 mm.
+    size : sizes of all five terms at n reaches, shape (n, 5)
+
+    Terms never computed count as the sixth, in proportion to the last two. On a real liver, that is
+    within a factor of three of the truth up to 20 mm.
     """
     fourth, fifth = size[:, 3], size[:, 4]
     ratio = np.minimum(fifth / np.maximum(fourth, 1e-30), 1.0)
@@ -209,6 +210,6 @@ def _linear_depth(beta: FloatArray, rule: LargeRule) -> float:
 
 
 def hyperelastic_problem(vademecum: Vademecum, material: LargeMaterial) -> Hyperelasticity:
-    """The large deformation problem on a vademecum's mesh, clamp and material."""
+    """Return the large deformation problem on a vademecum's mesh, clamp and material."""
     large = hyperelastic(material, vademecum.material)
     return Hyperelasticity(vademecum.mesh, large, vademecum.regions.clamped)

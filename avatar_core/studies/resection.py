@@ -41,8 +41,8 @@ LIMITS = {"mean": 0.03, "worst": 0.08}  # of the L2 error at unseen values
 class ResectionSettings:
     """Sizes of the study.
 
-    n_vertices : of the meshes, about
-    between : unseen values, as parts of the way from one stored value to the next
+    n_vertices : approximate number of mesh vertices
+    between : unseen values, as fractions of the way from one stored value to the next
     n_loads : unseen loads at each value
     """
 
@@ -73,7 +73,7 @@ class ResectionStudy(Study[ResectionSettings]):
                 run.rows += _rows(vademecum, organ, run.settings)
 
     def summary(self, run: Run[ResectionSettings]) -> dict[str, float]:
-        """Worst over both organs."""
+        """Return the worst errors over both organs."""
         unseen = where(run.rows, kind="opened", stored=False)
         stored, whole = where(run.rows, stored=True), where(run.rows, kind="whole")
         return {
@@ -121,7 +121,7 @@ STUDY = ResectionStudy()
 
 
 def resected(surface: SurfaceMesh, n_vertices: int) -> tuple[Organ, Organ]:
-    """An organ cut through its centroid, and the same before the cut."""
+    """Return an organ cut through its centroid, and the same before the cut."""
     mesh = tetrahedralize(surface, n_vertices)
     x, y, z = map(float, mesh.centroid)
     plane = CutSurface((0.0, -1.0, 0.0), (x, y, z), (1.0, 0.0, 0.0))
@@ -140,7 +140,7 @@ def resected(surface: SurfaceMesh, n_vertices: int) -> tuple[Organ, Organ]:
 
 
 def _whole_row(vademecum: Vademecum, whole: Vademecum, name: str) -> Row:
-    """The vademecum at 0 against that of the whole organ, at all load positions."""
+    """Compare the vademecum at 0 with the whole organ's, at all load positions."""
     n, mass = 3 * len(whole.mesh.vertices), whole.mesh.lumped_mass
     l2, contact = [], []
     for j in range(0, whole.surface.n_positions, 5):
@@ -153,7 +153,7 @@ def _whole_row(vademecum: Vademecum, whole: Vademecum, name: str) -> Row:
 
 
 def _rows(vademecum: Vademecum, organ: Organ, settings: ResectionSettings) -> list[Row]:
-    """Errors at stored values and between them, of loads and of the sag under the weight."""
+    """Return errors at stored values and between them, for loads and for the organ's sag."""
     last = COORDINATE.n_nodes - 1
     steps = [k + part for k in range(last) for part in (0.0, *settings.between)] + [float(last)]
     rows: list[Row] = []
@@ -188,7 +188,7 @@ def _rows(vademecum: Vademecum, organ: Organ, settings: ResectionSettings) -> li
 def _truths(
     vademecum: Vademecum, problem: Elasticity, n_loads: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Full solutions at the vertices: under some loads of the build, and under unit weights."""
+    """Return full solutions at the vertices: under some loads of the build, and unit weights."""
     surface = vademecum.surface
     some = np.linspace(0, surface.n_positions - 1, n_loads).astype(int)
     loads = patch_loads(problem, surface.centers[some], surface.patch_radius)
@@ -196,6 +196,6 @@ def _truths(
 
 
 def _of_organs(rows: list[Row], key: str) -> list[float]:
-    """A mean of a column for each organ."""
+    """Return a mean of a column for each organ."""
     names = dict.fromkeys(row["organ"] for row in rows)
     return [float(column(where(rows, organ=name), key).mean()) for name in names]

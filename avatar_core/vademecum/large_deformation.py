@@ -1,4 +1,4 @@
-"""Load magnitude as a coordinate: what large deformation adds to the linear response.
+"""Load magnitude as a coordinate: terms that large deformation adds to the linear response.
 
 A tip presses with a force f along the inward normal; f < 0 where a jaw pulls. With the linear depth
 a = gamma(s) f of its patch, gamma = n . C(s, s) n, the organ moves by
@@ -8,13 +8,12 @@ a = gamma(s) f of its patch, gamma = n . C(s, s) n, the organ moves by
 
 u_1 the linear vademecum, d the depth that is really reached. V_k and beta_k are terms of the
 asymptotic-numerical series (:mod:`avatar_core.reduction.asymptotic_series`), separated region by
-region of the load surface. Pushes and pulls have terms of their own, as two terms stand for four.
-They hold up to |a| = a_max(s); beyond, both continue tangentially. As stress is proportional to
-Young's modulus, V_k and beta_k do not depend on it.
+region of the load surface. Pushes and pulls have terms of their own, because two terms replace
+four. They hold up to |a| = a_max(s); beyond, both continue tangentially. Stress is proportional to
+Young's modulus, so that V_k and beta_k do not depend on it.
 
-Only the response of a patch to its own normal force is nonlinear; coupling between patches and
-forces along the surface stay linear. :mod:`avatar_core.certify.combinations` measures the
-error of that.
+Only the response of a patch to its own normal force is nonlinear. Coupling between patches and
+forces along the surface stay linear; :mod:`avatar_core.certify.combinations` measures this error.
 """
 
 from __future__ import annotations
@@ -44,12 +43,13 @@ LargeMaterial = Literal["neo-hookean", "st-venant-kirchhoff"]
 class LargeCertificate:
     """Errors over all pushes and pulls within the stored range.
 
-    n_sites, n_pushes : that could be compared; n_lost : sites where equilibrium was lost before
-        the range ended
-    depth : the deepest push compared [m]
-    n_pulls, pull_l2_mean, pull_l2_worst, pull_contact_mean, pull_linear_l2_mean : of outward forces
-    oblique_contact_mean, two_tools_contact_mean, gravity_contact_mean : of the force, where other
-        effects are added (:mod:`avatar_core.certify.combinations`); NaN: not measured
+    n_sites, n_pushes : numbers of compared sites and pushes
+    n_lost : sites where equilibrium was lost before the range ended
+    depth : deepest push compared [m]
+    n_pulls, pull_l2_mean, pull_l2_worst, pull_contact_mean, pull_linear_l2_mean : for outward
+        forces
+    oblique_contact_mean, two_tools_contact_mean, gravity_contact_mean : errors of the force with
+        other effects (:mod:`avatar_core.certify.combinations`); NaN: not measured
     """
 
     l2_mean: float
@@ -78,9 +78,14 @@ class LargeCertificate:
 class Push:
     """An organ pushed by a force along the inward normal, or pulled by a negative one.
 
-    displacement : ndarray, shape (3 n_vertices,) [m]
-    depth : of the patch, inward [m]
-    within : the force lies in the range that was computed
+    Attributes
+    ----------
+    displacement : ndarray, shape (3 n_vertices,)
+        Displacement [m].
+    depth : float
+        Inward depth of the patch [m].
+    within : bool
+        Whether the force lies in the computed range.
     """
 
     displacement: FloatArray
@@ -92,10 +97,16 @@ class Push:
 class LargeDeformation:
     """The terms of second and third order; k counts them.
 
-    material : of the large strains; its small ones are those of the vademecum
-    terms : BlockField, V_2 and V_3 of pushes, then of pulls, its loads at a position [m^(1-k)]
-    depth : ndarray, shape (2, 2, n_positions), beta_k of pushes and of pulls [m^(1-k)]
-    reach : ndarray, shape (2, n_positions), a_max of pushes and of pulls [m]
+    Attributes
+    ----------
+    material : LargeMaterial
+        Material of large strains; its small strains are those of the vademecum.
+    terms : BlockField
+        V_2 and V_3 of pushes, then of pulls, as loads at a position [m^(1-k)].
+    depth : ndarray, shape (2, 2, n_positions)
+        beta_k of pushes and of pulls [m^(1-k)].
+    reach : ndarray, shape (2, n_positions)
+        a_max of pushes and of pulls [m].
     certificate : LargeCertificate or None
     """
 
@@ -113,11 +124,9 @@ class LargeDeformation:
     def added_to(
         self, linear: Push, blocks: Blocks, positions: np.ndarray, weights: FloatArray
     ) -> Push:
-        """A linear push with the terms of second and third order at the same point.
+        """Return a linear push with the terms of second and third order at the same point.
 
-        Parameters
-        ----------
-        blocks : of the vademecum
+        blocks : blocks of the vademecum
         positions, weights : ndarray, shape (n,), of the point
         """
         side, size = (PUSH if linear.depth >= 0.0 else PULL), abs(linear.depth)
@@ -130,7 +139,7 @@ class LargeDeformation:
 
 
 def hyperelastic(name: str, linear: Material) -> HyperelasticMaterial:
-    """The material of a name, continuing a linear one.
+    """Return the material of a name, continuing a linear one.
 
     Raises
     ------
@@ -147,6 +156,6 @@ def hyperelastic(name: str, linear: Material) -> HyperelasticMaterial:
 
 
 def powers(a: float, reach: float) -> FloatArray:
-    """a^k of a >= 0 up to the reach and tangentially beyond, k = 2, 3."""
+    """Return a^k of a >= 0 up to the reach and tangentially beyond, k = 2, 3."""
     inside = min(a, reach)
     return np.array([inside**k + k * inside ** (k - 1) * (a - inside) for k in POWERS])

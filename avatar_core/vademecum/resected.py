@@ -9,7 +9,7 @@ from avatar_core.vademecum.model import Vademecum
 
 
 def part_volumes(v: Vademecum) -> tuple[float, float]:
-    """Volumes of the parts off and on the side of the resection's normal [m^3]."""
+    """Return the volumes of the parts off and on the side of the resection's normal [m^3]."""
     second = v.mesh.is_second_side
     return float(v.mesh.tet_volumes[~second].sum()), float(v.mesh.tet_volumes[second].sum())
 

@@ -1,22 +1,22 @@
 """A jaw that holds a point of the surface: a bilateral contact on the organ's compliance.
 
-A jaw that closes near the surface takes the material point s under it. From then on the patch at s
-moves with the tool, by y since the force was zero, as a bonded disc of the jaw's radius a does,
+A jaw that closes near the surface takes the material point s under it. The patch at s then moves
+with the tool, like a bonded disc of the jaw's radius a. With y its motion since the force was zero,
 
-    g = [C(s, s) - c L + L / (2 E* a)]^-1 (y - u),      L = n n^T + rho (I - n n^T),
+    g = [C(s, s) - c L + L / (2 E* a)]^-1 (y - u),      L = n n^T + rho (I - n n^T).
 
-g the force on the tissue, C the organ's compliance for a patch, c what a patch dents its own
-neighbourhood (:mod:`avatar_core.tips.law`), and u the displacement by all other causes. A disc that
-is bonded to a half-space yields by 1 / (2 E* a) along n, and along the surface by
-(2 - nu) / (8 G a) = rho / (2 E* a), rho = (2 - nu) / (2 (1 - nu)) (Mindlin, J. Appl. Mech. 16:259,
-1949; exact without friction, and for nu = 1/2). All tools are solved for together, which is the
-capacitance matrix of James & Pai (SIGGRAPH 1999). With large deformation, u has the added depth
--n k h(a), a = -gamma n . g, of :mod:`avatar_core.contact.effects.large_deformation`. As C is
-symmetric and s stays, the force is the derivative of one energy: no closed path gains.
+Here g is the force on the tissue, C the organ's compliance for a patch, and u the displacement by
+all other causes. c is the dent of a patch in its own neighbourhood (:mod:`avatar_core.tips.law`). A
+disc that is bonded to a half-space yields by 1 / (2 E* a) along n, and along the surface by (2 -
+nu) / (8 G a) = rho / (2 E* a), rho = (2 - nu) / (2 (1 - nu)) (Mindlin, J. Appl. Mech. 16:259, 1949;
+exact without friction, and for nu = 1/2). All tools are solved for together, which is the
+capacitance matrix of James & Pai (SIGGRAPH 1999). With large deformation, u has the added depth -n
+k h(a), a = -gamma n . g, of :mod:`avatar_core.contact.effects.large_deformation`. C is symmetric
+and s stays. The force is therefore the derivative of one energy: no closed path gains.
 
-It lets go when the jaw opens, or for good until then when the force exceeds what its friction
-holds. The tool touches nothing then until it has been outside: at depth, it would release energy
-that no tool has put in.
+The jaw lets go when it opens. It also lets go when the force exceeds the limit of its friction, and
+then holds nothing until it has opened. The tool touches nothing then until it has been outside: at
+depth, it would release energy that no tool has put in.
 """
 
 from __future__ import annotations
@@ -87,6 +87,7 @@ class Grasp(Effect):
             raise SceneError("grasp: a patch has no jaw; give the tool a sphere or another tip")
 
     def lay_out(self, ground: Ground) -> Any:
+        """Return radii and slip forces of the jaws."""
         self.require_jaw(ground.tips)
         jaws = [tip.grasp for tip in ground.tips]
         return self.Constants(
@@ -97,13 +98,13 @@ class Grasp(Effect):
 
 @inlined
 def is_held(model, data, t):  # type: ignore[no-untyped-def]
-    """Whether a tool holds tissue."""
+    """Return whether a tool holds tissue."""
     return model.grasp.on and data.grasp.held[t]
 
 
 @inlined
 def work_jaw(model, data, t):  # type: ignore[no-untyped-def]
-    """Open or close a jaw; whether it goes on holding what it held in the last period."""
+    """Open or close a jaw; return whether it still holds the tissue of the last period."""
     if not model.grasp.on or model.grasp.radius[t] == 0.0:
         return False
     grasp, tip = data.grasp, data.tip[t]
@@ -134,7 +135,10 @@ def work_jaw(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def _find_point(model, data, t):  # type: ignore[no-untyped-def]
-    """The material point X with X + u(X) under the tool, into ``place``; whether it can be held."""
+    """Find the material point X with X + u(X) under the tool; return whether it can be held.
+
+    It is written to ``place``.
+    """
     place, tip, slope = data.grasp.place[t], data.tip[t], data.slope[t]
     displacement = data.superposition.displacement
     for d in range(3):
@@ -192,9 +196,9 @@ def stiffen_jaw(model, data, t):  # type: ignore[no-untyped-def]
 
 @inlined
 def disc_compliance(model, data, t):  # type: ignore[no-untyped-def]
-    """1 / (2 E* a) [m/N].
+    """Return 1 / (2 E* a) [m/N].
 
-    A disc is as large on a curved surface: the shape factor of tips, whose contact is not, is left
+    A disc is as large on a curved surface. The shape factor of tips, whose contact is not, is left
     out.
     """
     stiffness = data.law.value[t, STIFFNESS] * np.exp(-data.law.shape[t])
@@ -203,7 +207,7 @@ def disc_compliance(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def _invert(c, out):  # type: ignore[no-untyped-def]
-    """The inverse of a 3 x 3 matrix, by cofactors."""
+    """Invert a 3 x 3 matrix, by cofactors."""
     for i in range(3):
         for j in range(3):
             a, b, p, q = (j + 1) % 3, (j + 2) % 3, (i + 1) % 3, (i + 2) % 3
@@ -216,7 +220,7 @@ def _invert(c, out):  # type: ignore[no-untyped-def]
 
 @fast
 def place_jaw(data, t, u0, u1, u2):  # type: ignore[no-untyped-def]
-    """y of a held tool. In its first period, y is the displacement u that it finds: no force."""
+    """Set y of a held tool; in its first period y is its displacement u, without force."""
     grasp, y = data.grasp, data.friction.offset[t]
     grasp.fresh[t] = False
     if not grasp.begun[t]:
@@ -230,7 +234,7 @@ def place_jaw(data, t, u0, u1, u2):  # type: ignore[no-untyped-def]
 
 @fast
 def pull(data, t, u0, u1, u2):  # type: ignore[no-untyped-def]
-    """Correct g by what the patch misses y; returns the largest part of that [m]."""
+    """Correct g by the patch's distance from y; return the largest component of that [m]."""
     g = data.friction.push[t]
     x0, x1, x2 = missed(data, t, u0, u1, u2)
     z0, z1, z2 = stiffness_times(data, t, x0, x1, x2)
@@ -241,14 +245,17 @@ def pull(data, t, u0, u1, u2):  # type: ignore[no-untyped-def]
 
 @inlined
 def missed(data, t, u0, u1, u2):  # type: ignore[no-untyped-def]
-    """Part of y that the patch has not moved, u its displacement without large deformation [m]."""
+    """Return the part of y that the patch has not moved, u without large deformation [m]."""
     y, n, depth = data.friction.offset[t], data.normal[t], data.grasp.bent[t, 0]
     return y[0] - u0 + n[0] * depth, y[1] - u1 + n[1] * depth, y[2] - u2 + n[2] * depth
 
 
 @fast
 def stiffness_times(data, t, x0, x1, x2):  # type: ignore[no-untyped-def]
-    """[K^-1 + tau n n^T]^-1 x, tau the derivative of the bent depth (Sherman & Morrison, 1950)."""
+    """Return [K^-1 + tau n n^T]^-1 x, tau the derivative of the bent depth.
+
+    Source: Sherman & Morrison, 1950.
+    """
     k, n, tau = data.grasp.stiffness[t], data.normal[t], data.grasp.bent[t, 1]
     w0 = k[0, 0] * n[0] + k[0, 1] * n[1] + k[0, 2] * n[2]
     w1 = k[1, 0] * n[0] + k[1, 1] * n[1] + k[1, 2] * n[2]
@@ -263,7 +270,7 @@ def stiffness_times(data, t, x0, x1, x2):  # type: ignore[no-untyped-def]
 
 @fast
 def hold_or_slip(model, data):  # type: ignore[no-untyped-def]
-    """Let go what is pulled harder than its jaw can hold."""
+    """Let go of tissue that is pulled harder than its jaw can hold."""
     if not model.grasp.on:
         return
     for t in range(data.tip.shape[0]):
@@ -276,7 +283,7 @@ def hold_or_slip(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def write_held_force(model, data, t, n):  # type: ignore[no-untyped-def]
-    """The force on a tool that holds tissue, and its contact, number n."""
+    """Write the force on a tool that holds tissue, and its contact, number n."""
     out, g, y = data.out, data.friction.push[t], data.friction.offset[t]
     for d in range(3):
         out.contact_position[n, d] = data.point[t, d] + y[d]
@@ -306,7 +313,7 @@ def linearly_moved(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def held_error(model, data, t):  # type: ignore[no-untyped-def]
-    """Relative error of the force of a held tool: of the patch, the disc, and small strains."""
+    """Return the relative force error of a held tool: of the patch, the disc, and small strains."""
     c = data.friction.compliance[t, t]
     patch = value_in_cell(
         model.force_error, cell_at(model.origin, model.spacing[0], data.grasp.place[t])

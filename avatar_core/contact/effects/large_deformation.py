@@ -1,10 +1,9 @@
 """Large deformation in the step: the depth of a tip is a nonlinear function of its load.
 
-See :mod:`avatar_core.vademecum.large_deformation`.
-It adds k h(a_t) to C_tt lambda_t, with a_t = gamma lambda_t, the matching term to the energy, and
-its derivative to the force. Beyond the reach that was computed, h continues as its tangent. k is
-what a tip leaves of the patch's compliance, 1 - c / gamma of
-:mod:`avatar_core.tips.law`, and 1 for the patch itself.
+See :mod:`avatar_core.vademecum.large_deformation`. The effect adds k h(a_t) to C_tt lambda_t, with
+a_t = gamma lambda_t, the matching term to the energy, and its derivative to the force. Beyond the
+computed reach, h continues as its tangent. For a tip, k = 1 - c / gamma of
+:mod:`avatar_core.tips.law`; for the patch itself, k = 1.
 """
 
 from __future__ import annotations
@@ -50,6 +49,7 @@ class LargeDeformation(Effect):
     )
 
     def require(self, vademecum: Vademecum) -> None:
+        """Refuse a vademecum without large deformation."""
         if vademecum.large is None:
             raise SceneError(
                 "large_deformation: the vademecum is linear; build one with "
@@ -58,6 +58,7 @@ class LargeDeformation(Effect):
 
     def lay_out(self, ground: Ground) -> Any:
         # Here, because the contact node needs none of it.
+        """Return coefficients and reach on the tip field's grid, and the loads of the modes."""
         from avatar_core.contact.organ_response import sampled_at_tip
 
         large, vademecum = ground.vademecum.large, ground.vademecum
@@ -70,7 +71,7 @@ class LargeDeformation(Effect):
 
 @inlined
 def sample_coefficients(model, data, t, tip):  # type: ignore[no-untyped-def]
-    """beta_2, beta_3, the reach and k at a tip, with their gradients."""
+    """Compute beta_2, beta_3, the reach and k at a tip, with their gradients."""
     large = data.large_deformation
     if not model.large_deformation.on:
         return
@@ -91,14 +92,14 @@ def sample_coefficients(model, data, t, tip):  # type: ignore[no-untyped-def]
 
 @fast
 def evaluate_added_depth(data, t):  # type: ignore[no-untyped-def]
-    """h(a) = beta_2 a^2 + beta_3 a^3 at the present force, its derivative and integral."""
+    """Compute h(a) = beta_2 a^2 + beta_3 a^3 at the present force, derivative and integral."""
     large = data.large_deformation
     _evaluate(data, t, data.self_compliance[t] * data.force[t], large.coefficient[t])
 
 
 @inlined
 def _evaluate(data, t, a, coefficient):  # type: ignore[no-untyped-def]
-    """k h and its derivatives at a >= 0, into ``added_depth``."""
+    """Compute k h and its derivatives at a >= 0, into ``added_depth``."""
     added, kept = data.large_deformation.added_depth[t], data.large_deformation.kept[t]
     b2, b3, reach = coefficient[0], coefficient[1], coefficient[2]
     inside = min(a, reach)
@@ -114,14 +115,14 @@ def _evaluate(data, t, a, coefficient):  # type: ignore[no-untyped-def]
 
 @fast
 def linear_depth(data, t):  # type: ignore[no-untyped-def]
-    """a of a tool that holds tissue, negative where it pulls [m]."""
+    """Return a of a tool that holds tissue, negative where it pulls [m]."""
     n, g = data.normal[t], data.friction.push[t]
     return -data.self_compliance[t] * (g[0] * n[0] + g[1] * n[1] + g[2] * n[2])
 
 
 @fast
 def bend_held(model, data, t):  # type: ignore[no-untyped-def]
-    """Inward depth that is added to what a tool holds, and its derivative by the inward force."""
+    """Compute the inward depth added to held tissue, and its derivative by the inward force."""
     if not model.large_deformation.on:
         return
     large, a, bent = data.large_deformation, linear_depth(data, t), data.grasp.bent[t]
@@ -132,7 +133,7 @@ def bend_held(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def is_held_too_far(model, data, t):  # type: ignore[no-untyped-def]
-    """Whether a tool has moved what it holds beyond the range of the response."""
+    """Return whether a tool has moved its tissue beyond the range of the response."""
     if linearly_moved(model, data, t) > FARTHEST:
         return True
     if not model.large_deformation.on:
@@ -143,7 +144,10 @@ def is_held_too_far(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def add_nonlinear_force(model, data, t):  # type: ignore[no-untyped-def]
-    """d/dp of the energy H = 1/gamma int_0^a h, at fixed force; whether a exceeds the reach."""
+    """Add d/dp of the energy H = 1/gamma int_0^a h at fixed force.
+
+    Returns whether a exceeds the reach.
+    """
     large = data.large_deformation
     if not model.large_deformation.on:
         return False
@@ -170,9 +174,9 @@ def add_nonlinear_force(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def powers_of_depth(model, data, t):  # type: ignore[no-untyped-def]
-    """|a|^2 and |a|^3 of a tip's linear depth a, continued by their tangents beyond the reach.
+    """Return |a|^2 and |a|^3 of a tip's linear depth a, continued by tangents beyond the reach.
 
-    Also the first of the loads that belong to them: 0 of a push, 2 of a pull.
+    The third value is the first of their loads: 0 for a push, 2 for a pull.
     """
     large, first = data.large_deformation, 0
     a, reach = data.self_compliance[t] * data.force[t], large.coefficient[t, 2]
@@ -187,7 +191,7 @@ def powers_of_depth(model, data, t):  # type: ignore[no-untyped-def]
 
 @fast
 def add_nonlinear_load(model, data, r, j, w, powers):  # type: ignore[no-untyped-def]
-    """Amplitudes of the nonlinear modes of a region by a part w of a tip at a load position."""
+    """Add amplitudes of a region's nonlinear modes by a part w of a tip at a load position."""
     second, third, first = powers
     amplitude = data.amplitude[
         model.large_deformation.start[r] : model.large_deformation.start[r + 1]
