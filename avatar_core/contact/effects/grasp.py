@@ -43,8 +43,8 @@ SLIPPED = int(Status.SLIPPED)
 REACH = 2e-3  # of a jaw that closes above the surface, and
 DEEPEST = 5e-3  # below it [m]
 FARTHEST = 5e-3  # displacement up to which the response was found to be linear within 2 % [m]
-# Relative error of the force that nine in ten pulls keep (`avatar study grasp`), beside that of the
-# patch; and what the displacement of the held point adds to it [1/m].
+# Relative error of the force that nine in ten pulls stay below (`avatar study grasp`), beside the
+# patch's; and its growth with the displacement of the held point [1/m].
 LAW_ERROR, STRETCH_ERROR = 0.05, 5.0
 _TOUCHING = 1e-6  # gap at which the held point is looked up [m]
 _STEPS = 4  # to the point that has come under the jaw, and from there to the surface
