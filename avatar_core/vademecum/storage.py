@@ -1,10 +1,10 @@
 """Vademecums on disk: HDF5 with schema version and checksum.
 
-Layout (schema 6.2), attributes at the root: ``format`` = "avatar vademecum", ``schema``,
-``name``, ``element``, ``checksum`` (SHA-256 over names, types, shapes and bytes of all datasets
-in sorted order and over the JSON attributes), and the JSON attributes ``material``,
-``provenance``, ``convergence``, ``certificate`` and ``accuracy``, its curve; those of the parts
-below are null or empty without them. Datasets:
+Layout (schema 6.2). Attributes at the root are ``format`` = "avatar vademecum", ``schema``,
+``name``, ``element`` and ``checksum``. The checksum is SHA-256 over names, types, shapes and bytes
+of all datasets in sorted order and over the JSON attributes. These are ``material``,
+``provenance``, ``convergence``, ``certificate``, ``accuracy`` (the curve), and those of the parts
+below, null or empty without a part. Datasets:
 
     mesh/vertices (n_v, 3) [m]          mesh/tets (n_t, 4)
     regions/clamped, regions/accessible over the boundary faces
@@ -15,14 +15,14 @@ below are null or empty without them. Datasets:
     blocks/vertex (64 n_blocks,)         field/region (n_s,), load (n_s, 3, most) [m/N]
     field/count (n_regions + 1,), start (n_regions + 1, n_blocks + 1), space (n_modes, 192),
     core (n_modes, most), level (n_modes,)
-    contact_near/start, target, block [m/N]: of the symmetric blocks those whose target is their
-    position or after it
+    contact_near/start, target, block [m/N]: symmetric blocks whose target is their position or
+    after it
     tip_field/distance, tip_field/access, tip_field/origin, tip_field/spacing [m]
     tip_field/tumour over a tumour
     tip_field/outline/vertices (n, 3) [m], faces (m, 3)
 
 A vademecum with coordinates of the material has the JSON attributes ``coordinates``,
-``contrast``, and
+``contrast``, and the datasets
 
     parametric/basis/space (3 n_v, n)    parametric/basis/load (3 n_s, n)
     parametric/operators (n_terms, n, n) parametric/n_global, rank, young_modulus [Pa]
@@ -30,23 +30,21 @@ A vademecum with coordinates of the material has the JSON attributes ``coordinat
     parametric/core (n_modes, n_global)
     parametric/contact_near (n_nodes, n_blocks, 3, 3) [m/N], as of contact_near
 
-one with the organ's mass body/mass (rank, rank) and body/weight (rank, 3),
-and the same under parametric/body for that basis; one with a finer surface or structures
-to display
+A vademecum with the organ's mass has body/mass (rank, rank) and body/weight (rank, 3), and the
+same under parametric/body for that basis. With a finer surface or structures to display it has
 
     display/vertices (n, 3) [m]          display/faces (m, 3)
     display/corners (n, 4)               display/weights (n, 4), of the mesh's vertices
     display/first_face (n_parts + 1,), with the JSON attribute ``parts``, their names
 
-one on supports supports/faces (n_supports, n_faces) over the boundary faces, with the JSON
-attribute ``supports``, their names and stiffnesses [N/m^3]; one that is cut
+On supports it has supports/faces (n_supports, n_faces) over the boundary faces. The JSON attribute
+``supports`` holds their names and stiffnesses [N/m^3]. If it is cut, it has
 
     mesh/pairs (n_pairs, 2), vertices of both sides at one place
     resection/direction (3,), fronts (n_strips + 1,) [m], opened, stiffness and halfway
-    [N/m^3];
+    [N/m^3]
 
-one with large deformation the JSON attribute
-``large`` (material, certificate) and, for k = 2, 3,
+With large deformation it has the JSON attribute ``large`` (material, certificate), and for k = 2, 3
 
     large/terms/..., load (n_s, 4, most) [m^(1-k)], as of field: of pushes, then of pulls
     large/depth (2, 2, n_s) [m^(1-k)]    large/reach (2, n_s) [m]
