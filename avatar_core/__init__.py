@@ -12,6 +12,12 @@
     data = model.data()                             # of one loop
     status = av.step(model, data, tips)             # 1 kHz; never fails: see data.out
 
+Further doors: ``av.effects`` (friction, viscoelasticity, jaws, ...), ``av.register`` (to a cloud),
+``av.calibrate`` (from touches), ``av.uncertainty`` (bands), ``av.mor`` (PGD, POD, Galerkin) and
+``av.shapes`` (LLE, kriging, level sets). Each public name has an example. There, ``liver`` is
+``av.phantom_liver(12e-3)`` and ``v`` its vademecum over Poisson's ratio. ``point`` lies on its
+surface with the outward ``normal``; ``K`` is a sparse stiffness and ``F`` holds loads.
+
 All lengths are in metres, forces in newtons. An error that a user can cure raises
 :class:`AvatarError`, with one line that names cause and remedy.
 
@@ -38,6 +44,7 @@ _ORIGIN = {
     "ContactModel": "contact.model",
     "Coordinate": "reduction.coordinates",
     "CutSurface": "geometry.cut_surface",
+    "Jaw": "geometry.tip",
     "LargeRule": "offline.large_deformation",
     "Material": "fem.elasticity",
     "OrganOptions": "pipeline",
@@ -73,6 +80,7 @@ _ORIGIN = {
     "save": "vademecum.storage:save_vademecum",
     "shapes": "shapes:",
     "step": "contact.model",
+    "step_many": "contact.many",
     "uncertainty": "uncertainty:",
 }
 
@@ -90,6 +98,7 @@ if TYPE_CHECKING:
     from avatar_core.atlas.patient import patient_vademecum as patient  # noqa: F401
     from avatar_core.atlas.storage import load_atlas as load_atlas
     from avatar_core.contact import effects as effects
+    from avatar_core.contact.many import step_many as step_many
     from avatar_core.contact.model import ContactData as ContactData
     from avatar_core.contact.model import ContactModel as ContactModel
     from avatar_core.contact.model import step as step
@@ -100,6 +109,7 @@ if TYPE_CHECKING:
     from avatar_core.geometry.phantom import phantom_liver as phantom_liver
     from avatar_core.geometry.surface import SurfaceMesh as SurfaceMesh
     from avatar_core.geometry.surface import read_surface as read_surface
+    from avatar_core.geometry.tip import Jaw as Jaw
     from avatar_core.geometry.tip import Tip as Tip
     from avatar_core.offline.large_deformation import LargeRule as LargeRule
     from avatar_core.offline.rule import BuildRule as BuildRule

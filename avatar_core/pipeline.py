@@ -43,7 +43,8 @@ from avatar_core.offline.supports import SupportOption, held_by
 from avatar_core.reduction.coordinates import RESECTION, Coordinate
 from avatar_core.vademecum.display import DISPLAYED, organ_display
 from avatar_core.vademecum.large_deformation import LargeMaterial
-from avatar_core.vademecum.model import Provenance, Vademecum
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.record import Provenance
 from avatar_core.vademecum.tip_field import make_tip_field, with_tumour
 
 COMBINED_SITES = 2  # at which large pushes are certified together with other effects

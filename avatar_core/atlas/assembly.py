@@ -20,7 +20,8 @@ from avatar_core.reduction.regional import separate_regions
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.display import Display, blocks_to_display
 from avatar_core.vademecum.modal_mass import motion_beside
-from avatar_core.vademecum.model import Convergence, Provenance, Vademecum
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.record import Convergence, Provenance
 from avatar_core.vademecum.tip_field import TipField
 
 

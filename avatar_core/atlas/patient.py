@@ -52,7 +52,8 @@ from avatar_core.shapes.correspondence import load_map
 from avatar_core.shapes.registration import Registration, register_template
 from avatar_core.shapes.weights import Barycenter
 from avatar_core.vademecum.display import DISPLAYED, Display, organ_display
-from avatar_core.vademecum.model import Convergence, RankError, Vademecum
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.record import Convergence, RankError
 from avatar_core.vademecum.tip_field import make_tip_field
 
 Fidelity = Literal["interpolated", "reduced", "solved"]

@@ -165,25 +165,42 @@ class LoadSurface:
             If the point is not finite, or farther than 5 mm from the accessible surface.
         """
         asked = np.array(point, float).reshape(-1)
-        if asked.shape != (3,) or not np.isfinite(asked).all():
+        if asked.shape != (3,):
+            raise LoadError("a point is three finite numbers; give x, y, z in metres")
+        return self.nearest_each(asked[None])[0]
+
+    def nearest_each(self, points: np.ndarray) -> list[SurfacePoint]:
+        """Return the nearest points of the accessible surface to several points, shape (k, 3) [m].
+
+        Raises
+        ------
+        LoadError
+            As :meth:`nearest`, for the first point that is refused.
+        """
+        if not np.isfinite(points).all():
             raise LoadError("a point is three finite numbers; give x, y, z in metres")
         square, face, found = igl.point_mesh_squared_distance(
-            asked[None], self.centers, self.corners.astype(np.int64)
+            points, self.centers, self.corners.astype(np.int64)
         )
-        distance = float(np.sqrt(np.ravel(square)[0]))
-        if distance > FARTHEST:
+        distance, faces = np.sqrt(np.ravel(square)), np.ravel(face).astype(int)
+        for off in distance[distance > FARTHEST]:
             raise LoadError(
-                f"the load is {1e3 * distance:.1f} mm off the accessible surface; give a point "
+                f"the load is {1e3 * off:.1f} mm off the accessible surface; give a point "
                 f"within {1e3 * FARTHEST:g} mm of it, in metres"
             )
-        faces, on_surface = np.ravel(face)[:1].astype(int), np.reshape(found, (-1, 3))[0]
-        corners = self.centers[self.corners[faces[0]]]
-        barycentric = np.linalg.lstsq(
-            np.vstack([corners.T, np.ones(3)]), np.append(on_surface, 1.0), rcond=None
-        )[0]
-        positions, weights = self.weights(faces, barycentric[None])
-        normal = weights[0] @ self.normals[positions[0]]
-        return SurfacePoint(positions[0], weights[0], on_surface, normal / np.linalg.norm(normal))
+        on_surface = np.reshape(found, (-1, 3))
+        corners = self.centers[self.corners[faces]]
+        barycentric = [
+            np.linalg.lstsq(np.vstack([c.T, np.ones(3)]), np.append(p, 1.0), rcond=None)[0]
+            for c, p in zip(corners, on_surface, strict=True)
+        ]
+        positions, weights = self.weights(faces, np.array(barycentric).reshape(-1, 3))
+        normals = np.einsum("kn,knd->kd", weights, self.normals[positions])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return [
+            SurfacePoint(*each)
+            for each in zip(positions, weights, on_surface, normals, strict=True)
+        ]
 
 
 def default_patch_radius(mesh: TetMesh, regions: Regions) -> float:

@@ -39,7 +39,8 @@ from avatar_core.vademecum.modal_mass import (
     body_response,
     motion_beside,
 )
-from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.record import Convergence, Provenance, RankError
 from avatar_core.vademecum.tip_field import TipField
 
 _ENERGY_TOLERANCE = 3e-3  # at which PGD stops: beyond, single precision has no more to say

@@ -50,7 +50,7 @@ from avatar_core.vademecum.modal_mass import (
     principal_sags,
     sag_of,
 )
-from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
+from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.parametric import (
     GalerkinBasis,
     ParametricResponse,
@@ -59,6 +59,7 @@ from avatar_core.vademecum.parametric import (
     regional_load_of_basis,
     stiffness_root,
 )
+from avatar_core.vademecum.record import Convergence, Provenance, RankError
 from avatar_core.vademecum.tip_field import TipField
 
 _LEAST_SAG = 1e-3  # least relative remainder of a sag that gets its own function

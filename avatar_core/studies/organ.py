@@ -13,7 +13,8 @@ from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.parametric import build_parametric_vademecum
 from avatar_core.offline.rule import BuildRule, Progress
 from avatar_core.reduction.coordinates import Coordinate
-from avatar_core.vademecum.model import Provenance, Vademecum
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.record import Provenance
 from avatar_core.vademecum.tip_field import TipField, make_tip_field
 
 

@@ -11,7 +11,7 @@ definite by construction, and exact at the load positions themselves.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -19,14 +19,13 @@ from numpy.typing import ArrayLike
 
 from avatar_core.errors import ConvergenceError, LoadError
 from avatar_core.fem.elasticity import Element, Material
-from avatar_core.fem.patch_loads import LoadSurface
+from avatar_core.fem.patch_loads import LoadSurface, SurfacePoint
 from avatar_core.fem.patch_on_plane import missed_between
 from avatar_core.fem.resection import Resection
 from avatar_core.fem.supports import Support
 from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.reduction.block_field import BlockField, Blocks
 from avatar_core.reduction.near_field import LocalBlocks
-from avatar_core.reduction.pgd import EnrichmentReport
 from avatar_core.reduction.separated import SeparatedField
 from avatar_core.vademecum.at_values import Valued, at_values, ranges
 from avatar_core.vademecum.certificate import Certificate
@@ -34,112 +33,11 @@ from avatar_core.vademecum.display import ORGAN, WALLS, Display
 from avatar_core.vademecum.large_deformation import LargeCertificate, LargeDeformation, Push
 from avatar_core.vademecum.modal_mass import BodyResponse
 from avatar_core.vademecum.parametric import ParametricResponse
+from avatar_core.vademecum.record import Convergence, Provenance, VademecumInfo
 from avatar_core.vademecum.tip_field import TipField
 
-
-@dataclass(frozen=True)
-class Provenance:
-    """Origin of a vademecum: enough to build it again.
-
-    Attributes
-    ----------
-    source : str
-        File name of the surface, ``source_sha256`` its hash.
-    unit, axes : str
-        Unit and axes applied on reading.
-    versions : tuple[str, ...]
-        "package version" of everything that took part.
-    parameters : tuple[str, ...]
-        "name=value" of the build.
-    notices : tuple[str, ...]
-        Notices of the reader of the surface and of the build.
-    """
-
-    source: str
-    source_sha256: str
-    unit: str = "m"
-    axes: str = "RAS"
-    versions: tuple[str, ...] = ()
-    parameters: tuple[str, ...] = ()
-    notices: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class RankError:
-    """Relative L2 error over the build's own loads with ``rank`` modes at a place."""
-
-    rank: int
-    mean: float
-    worst: float
-
-
-@dataclass(frozen=True)
-class Convergence:
-    """Record of the search for modes.
-
-    Attributes
-    ----------
-    converged : bool
-        Whether the tolerance was met within the mode limit.
-    tolerance : float
-        Requested mean relative L2 error over the build's own loads.
-    enrichments : tuple[EnrichmentReport, ...]
-        One report for each enrichment.
-    rank_errors : tuple[RankError, ...]
-        Error against number of modes at a place.
-    every_mean, every_worst : float
-        Relative L2 error of the field under every load of the build, in three directions at each
-        position. NaN for a patient whose loads are not all solved.
-    """
-
-    converged: bool
-    tolerance: float
-    enrichments: tuple[EnrichmentReport, ...] = ()
-    rank_errors: tuple[RankError, ...] = ()
-    every_mean: float = float("nan")
-    every_worst: float = float("nan")
-
-    def with_errors(self, errors: np.ndarray) -> Convergence:
-        """Return the same record with the errors of the field, any shape."""
-        return replace(self, every_mean=float(errors.mean()), every_worst=float(errors.max()))
-
-
-@dataclass(frozen=True)
-class VademecumInfo:
-    """Summary of a vademecum; the fields of avatar_interfaces/msg/VademecumInfo.
-
-    Attributes
-    ----------
-    force_mean, force_worst : float
-        Relative error at a depth, anywhere on the surface that tips reach.
-    """
-
-    id: str
-    name: str
-    source: str
-    schema_version: str
-    axes: str
-    n_vertices: int
-    n_surface_vertices: int
-    n_load_positions: int
-    n_modes: int
-    n_regions: int
-    bytes: int
-    young_modulus: float
-    poisson_ratio: float
-    patch_radius: float
-    volume: float
-    converged: bool
-    l2_mean: float
-    l2_worst: float
-    contact_mean: float
-    contact_worst: float
-    force_mean: float
-    force_worst: float
-    build_cpu_seconds: float
-
-
 SCHEMA_VERSION = "6.2"
+_AT_ONCE = 64  # points of a batch, so that its forces fill some megabytes
 
 
 @dataclass(frozen=True)
@@ -286,31 +184,71 @@ class Vademecum:
         )
 
     def displacement_at(self, point: ArrayLike, force: ArrayLike) -> np.ndarray:
-        """Displacement of all vertices under a force at a point, shape (n_vertices, 3) [m].
+        """Return the displacement of all vertices under a force at a point, or each of several.
 
         Where the vademecum holds large deformation, the part of the force along the normal deforms
         the organ nonlinearly; the part along the surface is added linearly.
 
         Parameters
         ----------
-        point : array_like, shape (3,) [m], at most 5 mm off the accessible surface
-        force : float, along the inward normal, or array_like, shape (3,) [N]
+        point : array_like, shape (3,) or (k, 3)
+            Points at most 5 mm off the accessible surface [m].
+        force : float or array_like, shape (3,), (k,) or (k, 3)
+            Force at each point, along the inward normal or as a vector [N].
+
+        Returns
+        -------
+        ndarray, shape (n_vertices, 3) or (k, n_vertices, 3)
+            Displacements [m]. Those of several points are not added.
 
         Raises
         ------
         LoadError
-            If the point lies off the accessible surface, or a number is not finite.
+            If a point lies off the accessible surface, a number is not finite, or there is not one
+            force for each point.
         """
-        place = self.surface.nearest(point)
-        given = np.array(force, float).reshape(-1)
-        if given.size not in (1, 3) or not np.isfinite(given).all():
+        points, forces = np.asarray(point, float), np.asarray(force, float)
+        if points.ndim < 2:
+            if forces.size not in (1, 3):
+                raise LoadError("a force is one or three finite numbers; give newtons")
+            one = forces.reshape(1, 3) if forces.size == 3 else forces.reshape(1)
+            return np.asarray(self.displacement_at(points.reshape(1, -1), one)[0])
+        k = len(points)
+        if points.shape != (k, 3) or forces.shape not in ((), (k,), (k, 3)):
+            raise LoadError(
+                f"points of shape {points.shape} with forces of shape {forces.shape}; give k "
+                "points of three coordinates, and one number or three for each"
+            )
+        if not np.isfinite(forces).all():
             raise LoadError("a force is one or three finite numbers; give newtons")
-        vector = -given[0] * place.normal if given.size == 1 else given
-        pressing = -float(vector @ place.normal)
-        rest = vector + pressing * place.normal
-        pressed = self.push(place.positions, place.weights, pressing).displacement
-        dragged = self.displacement(place.positions, place.weights) @ rest
-        return np.asarray(pressed + dragged).reshape(-1, 3)
+        places = self.surface.nearest_each(points)
+        normals = np.array([place.normal for place in places]).reshape(k, 3)
+        vectors = forces if forces.ndim == 2 else -np.broadcast_to(forces, k)[:, None] * normals
+        moved = np.empty((k, len(self.mesh.vertices), 3))
+        for first in range(0, k, _AT_ONCE):
+            part = slice(first, first + _AT_ONCE)
+            moved[part] = self._moved(places[part], vectors[part])
+        if self.large is not None:
+            pressing = -np.einsum("kd,kd->k", vectors, normals)
+            for i in np.flatnonzero(pressing):
+                place = places[i]
+                own = self.compliance(place.positions, place.weights)
+                depth = float(pressing[i] * (place.normal @ own @ place.normal))
+                linear = Push(moved[i].ravel(), depth, within=True)
+                bent = self.large.added_to(linear, self.blocks, place.positions, place.weights)
+                moved[i] = bent.displacement.reshape(-1, 3)
+        return moved
+
+    def _moved(self, places: Sequence[SurfacePoint], forces: np.ndarray) -> np.ndarray:
+        """Return the linear displacement under forces (k, 3), each at its place, (k, n, 3) [m]."""
+        k, unit = len(places), np.eye(3, dtype=np.float32)
+        positions = np.array([place.positions for place in places])
+        loads = np.zeros((*positions.shape, 3, k, 3), np.float32)
+        for i, place in enumerate(places):
+            loads[i, :, :, i] = place.weights.astype(np.float32)[:, None, None] * unit
+        field = self.field.under(positions.ravel(), loads.reshape(-1, 3, 3 * k))
+        by_axis = self.blocks.at_vertices(field).reshape(-1, k, 3)
+        return np.asarray((by_axis * forces).sum(axis=2)).T.reshape(k, -1, 3)
 
     def compliance_at(self, point: ArrayLike, other: ArrayLike | None = None) -> np.ndarray:
         """Contact compliance at a point, or between two, shape (3, 3) [m/N].

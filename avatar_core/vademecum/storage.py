@@ -86,8 +86,9 @@ from avatar_core.vademecum.large_deformation import (
     LargeMaterial,
 )
 from avatar_core.vademecum.modal_mass import BodyResponse
-from avatar_core.vademecum.model import SCHEMA_VERSION, Convergence, Provenance, Vademecum
+from avatar_core.vademecum.model import SCHEMA_VERSION, Vademecum
 from avatar_core.vademecum.parametric import ParametricResponse
+from avatar_core.vademecum.record import Convergence, Provenance
 from avatar_core.vademecum.schema import (
     BODY_KEYS,
     DISPLAY_KEYS,

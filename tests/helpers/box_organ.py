@@ -16,7 +16,8 @@ from avatar_core.geometry.mesh import Regions, TetMesh
 from avatar_core.geometry.refinement import Grading, refine
 from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import BuildRule
-from avatar_core.vademecum.model import Provenance, Vademecum
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.record import Provenance
 from avatar_core.vademecum.tip_field import make_tip_field
 from tests.core.conftest import box_mesh, box_regions
 from tests.helpers.disk_cache import cached_on_disk

@@ -26,8 +26,9 @@ from avatar_core.shapes.registration import RegistrationQuality, SimilarityTrans
 from avatar_core.vademecum.certificate import Certificate
 from avatar_core.vademecum.large_deformation import POWERS, LargeCertificate, LargeDeformation
 from avatar_core.vademecum.modal_mass import BodyResponse
-from avatar_core.vademecum.model import Convergence, Provenance, RankError, Vademecum
+from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.parametric import ParametricResponse
+from avatar_core.vademecum.record import Convergence, Provenance, RankError
 from avatar_core.vademecum.tip_field import Outline, TipField
 
 RADIUS = 0.06  # [m]

@@ -9,6 +9,7 @@ import numpy as np
 
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress
+from avatar_core.studies.bench.many import steps_per_second
 from avatar_core.studies.bench.methods import (
     TABLES,
     StepRow,
@@ -58,6 +59,7 @@ def time_organ(organ: Vademecum) -> tuple[list[StepRow], dict[str, float]]:
         "table_of_16_bits_over_step": table_over_steps(organ, kind=np.int16),
         "step_p50_us": _row(rows, 1).p50_us,
         "step_p99_us": _row(rows, N_TOOLS).p99_us,
+        **steps_per_second(organ),
         "rival_p99_us": _row(rows, N_TOOLS, "dense table").p99_us,
     }
 

@@ -34,7 +34,8 @@ from avatar_core.offline.rule import BuildRule
 from avatar_core.tips.law import SLOPE_ERROR, VARIATION_ERROR
 from avatar_core.vademecum.certificate import Certificate, ContactSites
 from avatar_core.vademecum.force_error import PROMISED, ForceError
-from avatar_core.vademecum.model import Provenance, Vademecum
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.record import Provenance
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from avatar_core.vademecum.tip_field import make_tip_field
 from tests.core.cli.test_cli import write_obj

@@ -25,7 +25,8 @@ from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.rule import BuildRule
 from avatar_core.vademecum import tip_field
 from avatar_core.vademecum.certificate import Certificate
-from avatar_core.vademecum.model import Provenance, Vademecum
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.record import Provenance
 from tests.helpers.elastic_shapes import (
     TOP,
     block,

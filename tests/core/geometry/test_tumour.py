@@ -17,7 +17,8 @@ from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.resolved_contact import contacts_at
 from avatar_core.offline.rule import BuildRule
 from avatar_core.tips.profile import STIFFNESS
-from avatar_core.vademecum.model import Provenance, Vademecum
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.record import Provenance
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 from avatar_core.vademecum.tip_field import with_tumour
 from tests.core.offline.test_coordinates import ball

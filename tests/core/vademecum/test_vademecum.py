@@ -15,7 +15,7 @@ import pytest
 
 from avatar_core.certify.linear import certify
 from avatar_core.common.hdf5 import replace_file
-from avatar_core.errors import StorageError
+from avatar_core.errors import LoadError, StorageError
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import relative_l2
 from avatar_core.geometry.phantom import phantom_liver
@@ -231,3 +231,23 @@ def test_arrays_that_do_not_fit_are_refused(
     replace_file(tmp_path / "spoilt.h5", arrays, attributes)
     with pytest.raises(StorageError, match=message):
         load_vademecum(tmp_path / "spoilt.h5")
+
+
+def test_a_batch_of_points_is_each_of_them(phantom_vademecum: Vademecum) -> None:
+    v, rng = phantom_vademecum, np.random.default_rng(0)
+    points = v.surface.centers[rng.choice(v.surface.n_positions, 300)] + 1e-3
+    vectors, sizes = rng.standard_normal((300, 3)), rng.uniform(0.1, 2.0, 300)
+    for forces in (vectors, sizes):
+        found = v.displacement_at(points, forces)
+        for k in (0, 7, 64, 299):
+            alone = v.displacement_at(points[k], forces[k])
+            np.testing.assert_allclose(found[k], alone, atol=1e-6 * np.abs(alone).max())
+    place = v.surface.nearest(points[7])
+    pushed = v.push(place.positions, place.weights, float(sizes[7])).displacement.reshape(-1, 3)
+    np.testing.assert_allclose(found[7], pushed, atol=1e-6 * np.abs(pushed).max())
+    np.testing.assert_array_equal(v.displacement_at(points[:2], 1.0)[1].shape, pushed.shape)
+    assert v.displacement_at(np.empty((0, 3)), 1.0).shape == (0, *pushed.shape)
+    with pytest.raises(LoadError, match="one number or three for each"):
+        v.displacement_at(points[:4], sizes[:3])
+    with pytest.raises(LoadError, match="off the accessible surface"):
+        v.displacement_at(points[:4] + np.array([0.0, 0.0, 1.0]), sizes[:4])

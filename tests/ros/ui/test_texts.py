@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from viser import ViserServer
 
-from avatar_core.vademecum.model import VademecumInfo
+from avatar_core.vademecum.record import VademecumInfo
 from avatar_interfaces.msg import ContactState
 from avatar_ros.framework.templates import stamp_bytes
 from avatar_ros.loop.statuses import EXPLANATIONS, explanation

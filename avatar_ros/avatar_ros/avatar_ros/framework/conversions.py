@@ -17,7 +17,7 @@ from avatar_interfaces.msg import VademecumFile, VademecumInfo
 
 
 def vademecum_info(info: dict[str, Any], header: Header) -> VademecumInfo:
-    """Convert the fields of an ``avatar_core.vademecum.model.VademecumInfo`` to its message."""
+    """Convert the fields of an ``avatar_core.vademecum.record.VademecumInfo`` to its message."""
     return VademecumInfo(header=header, **info)
 
 

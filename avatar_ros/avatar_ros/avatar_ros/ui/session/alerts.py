@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from avatar_core.fem.elasticity import Material
-from avatar_core.vademecum.model import VademecumInfo
+from avatar_core.vademecum.record import VademecumInfo
 from avatar_interfaces.msg import ContactState
 from avatar_ros.ui.session.shown_period import ShownPeriod
 from avatar_ros.ui.session.texts import of_tools

@@ -13,7 +13,8 @@ from avatar_core.common.supports import SUPPORT
 from avatar_core.contact.tool_path import middle_of_access, starts_apart
 from avatar_core.geometry.tip import Tip
 from avatar_core.reduction.coordinates import RESECTION
-from avatar_core.vademecum.model import Vademecum, VademecumInfo
+from avatar_core.vademecum.model import Vademecum
+from avatar_core.vademecum.record import VademecumInfo
 from avatar_core.vademecum.resected import margins, part_volumes
 from avatar_ros.loop.settings import MATERIAL
 from avatar_ros.prepare.scenes import usable_material
