@@ -4,7 +4,16 @@ from __future__ import annotations
 
 
 class AvatarError(Exception):
-    """Base of every error that a user can cause and cure."""
+    """Base of every error that a user can cause and cure.
+
+    Examples
+    --------
+    >>> try:
+    ...     av.Material(poisson_ratio=0.7)
+    ... except av.AvatarError as error:
+    ...     print(str(error)[:22])
+    Poisson's ratio is 0.7
+    """
 
 
 def one_line(error: object, longest: int = 500) -> str:

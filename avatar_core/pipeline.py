@@ -103,6 +103,14 @@ class OrganOptions:
     ------
     ContactError, CoordinateError, MaterialError, MeshError, SurfaceError
         For options that exclude each other, and for a file that does not exist, before any work.
+
+    Examples
+    --------
+    >>> options = av.OrganOptions(
+    ...     n_vertices=400, coordinates=(av.Coordinate("poisson", 0.40, 0.48),)
+    ... )
+    >>> [c.name for c in options.all_coordinates]
+    ['poisson']
     """
 
     n_vertices: int = 2850
@@ -199,6 +207,15 @@ def build(
     ------
     AvatarError
         Of the stage that refused, with the remedy.
+
+    Examples
+    --------
+    >>> options = av.OrganOptions(
+    ...     n_vertices=300, n_displayed=0, n_certified=4, rule=av.BuildRule(max_modes=20)
+    ... )
+    >>> small = av.build(liver, options)  # seconds; the default takes a minute
+    >>> small.n_modes <= 20
+    True
     """
     options = options or OrganOptions()
     provenance = _provenance(surface, options)
@@ -298,6 +315,12 @@ class OrganProblem:
         Clamped and accessible faces over ``elasticity.mesh.boundary_faces``.
     surface : LoadSurface
         Load positions, normals and patch radius.
+
+    Examples
+    --------
+    >>> problem = av.organ_problem(liver, av.OrganOptions(n_vertices=300))
+    >>> problem.loads.shape[1] == 3 * problem.surface.n_positions
+    True
     """
 
     elasticity: Elasticity
@@ -328,6 +351,13 @@ def organ_problem(surface: SurfaceMesh, options: OrganOptions | None = None) -> 
     ------
     AvatarError
         If the surface cannot be meshed or held; the message names the remedy.
+
+    Examples
+    --------
+    >>> problem = av.organ_problem(liver, av.OrganOptions(n_vertices=300))
+    >>> u = problem.elasticity.solve(problem.loads[:, :3])
+    >>> u.shape[1]
+    3
     """
     options = options or OrganOptions()
     elasticity, regions = _problem(surface, options)

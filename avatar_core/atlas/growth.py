@@ -179,6 +179,13 @@ def create_atlas(
         If the folder holds something else, or another build is at work on it.
     StorageError
         If it cannot be written.
+
+    Examples
+    --------
+    >>> options = {"template": template, "workers": alone, "solve_response": solver}
+    >>> grown = av.create_atlas("created", [liver, larger], rough_options, **options)
+    >>> grown.atlas.names
+    ('larger', 'phantom')
     """
     folder, options = Path(path), options or AtlasOptions()
     with _folder_of(folder):
@@ -198,6 +205,13 @@ def extend_atlas(
 
     Arguments are those of `create_atlas`. Raises StorageError if there is no atlas at the path or
     it cannot be written, AtlasError if another build is at work on it.
+
+    Examples
+    --------
+    >>> given = {"template": template, "workers": alone}
+    >>> grown = av.create_atlas("grown", [liver], rough_options, **given)
+    >>> av.extend_atlas("grown", [larger], workers=alone).added
+    ('larger',)
     """
     folder = Path(path)
     frame, _ = load_frame(folder)

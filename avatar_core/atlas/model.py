@@ -67,6 +67,11 @@ class Atlas:
     Notes
     -----
     The readers raise StorageError for a file that is missing, altered or of another anatomy.
+
+    Examples
+    --------
+    >>> atlas.names
+    ('larger', 'phantom')
     """
 
     frame: Frame

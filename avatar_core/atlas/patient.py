@@ -98,6 +98,11 @@ class PatientOptions:
         Tolerance and numbers of modes of the vademecum.
     reduction : ReductionRule
         Enrichment of ``reduced``.
+
+    Examples
+    --------
+    >>> av.PatientOptions(n_vertices=1500, weighting="kriging", tolerance=0.02).n_neighbors is None
+    True
     """
 
     n_vertices: int = 2850
@@ -170,6 +175,13 @@ class Patient:
         one line each.
     seconds : StageSeconds
         CPU time of each stage.
+
+    Examples
+    --------
+    >>> options = av.PatientOptions(n_certified=0, n_displayed=0)
+    >>> found = av.patient(liver, atlas, "interpolated", options)
+    >>> found.fidelity, found.weights.sum().round(6)
+    ('interpolated', 1.0)
     """
 
     vademecum: Vademecum
@@ -199,6 +211,13 @@ def patient_vademecum(
         For an unknown fidelity or weighting, or an atlas without responses.
     AvatarError
         Of the stage that failed, with the remedy.
+
+    Examples
+    --------
+    >>> options = av.PatientOptions(n_certified=0, n_displayed=0)
+    >>> found = av.patient(liver, atlas, "interpolated", options)
+    >>> found.vademecum.n_modes > 0
+    True
     """
     base = base_of(atlas) if isinstance(atlas, Atlas) else atlas
     options = options or PatientOptions()

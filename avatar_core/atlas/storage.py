@@ -114,6 +114,11 @@ def load_atlas(path: str | Path) -> Atlas:
     ------
     StorageError
         For a folder that is no atlas, and for a truncated, altered or foreign file in it.
+
+    Examples
+    --------
+    >>> av.load_atlas("base").names
+    ('larger', 'phantom')
     """
     folder = Path(path)
     frame, _ = load_frame(folder)

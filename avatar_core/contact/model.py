@@ -69,6 +69,12 @@ class ContactModel:
         Where they lie, for compiled code.
     compiled : callable
         The step, the same for all models.
+
+    Examples
+    --------
+    >>> model = av.prepare(v, av.Scene(effects=()))
+    >>> model.n_tools, model.data() is model.data()
+    (1, False)
     """
 
     def __init__(self, arrays: Any) -> None:
@@ -111,6 +117,12 @@ class ContactData:
         Where these arrays lie, for compiled code.
     turns : bool
         Whether it matters that a tool turns.
+
+    Examples
+    --------
+    >>> data = av.prepare(v).data()
+    >>> data.out.force.shape  # of one tool [N]
+    (1, 3)
     """
 
     def __init__(self, model: ContactModel) -> None:
@@ -225,6 +237,15 @@ def step(
         surface; these tools have no force or a fading one. NOT_CONVERGED: the contact forces are
         those of the last iteration. EXTRAPOLATED: deeper than the computed large deformation, or
         pulled too far. SLIPPED: the jaw lost what it held.
+
+    Examples
+    --------
+    >>> model = av.prepare(v, av.Scene(effects=()))
+    >>> data = model.data()
+    >>> for depth in np.linspace(-5e-3, 2e-3, 50):  # a sphere of 5 mm comes down
+    ...     status = av.step(model, data, point + (5e-3 - depth) * normal)
+    >>> status == av.Status.OK, np.linalg.norm(data.out.force[0]) > 0.1  # [N]
+    (True, True)
     """
     status = solve(model, data, tips, orientations, jaws)
     deform(model, data)

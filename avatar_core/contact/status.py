@@ -19,6 +19,11 @@ class Status(IntEnum):
 
     ``step`` returns OK, INVALID_POSE, NOT_CONVERGED, TOO_MANY_CONTACTS, OUT_OF_RANGE,
     EXTRAPOLATED or SLIPPED; the loop of the contact node gives the others.
+
+    Examples
+    --------
+    >>> av.Status(av.step(model, model.data(), outside)) is av.Status.OK
+    True
     """
 
     meaning: str

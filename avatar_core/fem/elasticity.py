@@ -57,6 +57,12 @@ class Material:
         Young's modulus E > 0 [Pa].
     poisson_ratio : float
         Poisson's ratio, 0 <= nu < 0.5.
+
+    Examples
+    --------
+    >>> soft = av.Material(young_modulus=5e3, poisson_ratio=0.45)
+    >>> round(soft.plane_strain_modulus)
+    6270
     """
 
     young_modulus: float = 0.17e6

@@ -53,6 +53,12 @@ class CutSurface:
     ------
     MeshError
         For numbers that make no surface, or a direction along its normal.
+
+    Examples
+    --------
+    >>> plane = av.CutSurface(open_along=(0, 0, 1), point=(0, 0, 0), normal=(1, 0, 0))
+    >>> plane.part
+    1.0
     """
 
     open_along: Triple

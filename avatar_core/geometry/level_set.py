@@ -43,6 +43,11 @@ class GridBox:
         Distance of neighbouring points, the same along x, y, z [m].
     shape : tuple[int, int, int]
         Numbers of points (nx, ny, nz).
+
+    Examples
+    --------
+    >>> av.shapes.GridBox(origin=(0.0, 0.0, 0.0), spacing=0.1, shape=(2, 3, 4)).points.shape
+    (24, 3)
     """
 
     origin: tuple[float, float, float]
@@ -77,6 +82,12 @@ class DistanceGrid:
         Distance of neighbouring grid points, the same along x, y, z [m].
     values : ndarray, shape (nx, ny, nz)
         Signed distances [m].
+
+    Examples
+    --------
+    >>> grid = av.shapes.distance_grid(liver, spacing=15e-3, padding=30e-3)
+    >>> grid.sample(np.zeros((1, 3)))[0] < 0.0  # inside
+    True
     """
 
     origin: FloatArray
@@ -149,7 +160,13 @@ class OrientationOffset:
 
 
 def padded_box(surfaces: Sequence[SurfaceMesh], spacing: float, padding: float) -> GridBox:
-    """Return the box that reaches padding [m] beyond all surfaces on every side."""
+    """Return the box that reaches padding [m] beyond all surfaces on every side.
+
+    Examples
+    --------
+    >>> av.shapes.padded_box([liver], spacing=15e-3, padding=30e-3).margin(liver) >= 30e-3
+    True
+    """
     low = np.min([surface.bounding_box[0] for surface in surfaces], axis=0)
     high = np.max([surface.bounding_box[1] for surface in surfaces], axis=0)
     nx, ny, nz = (int(n) + 1 for n in np.ceil((high - low + 2 * padding) / spacing))
@@ -172,6 +189,12 @@ def distance_grid(
         Distance from the organ to the sides of the grid [m].
     band : float or None
         Distances are cut to [-band, band]; see `distance_in_box`.
+
+    Examples
+    --------
+    >>> grid = av.shapes.distance_grid(liver, spacing=15e-3, padding=30e-3)
+    >>> abs(grid.volume - liver.volume) < 0.05 * liver.volume
+    True
     """
     return distance_in_box(surface, padded_box([surface], spacing, padding), band)
 
@@ -186,6 +209,12 @@ def distance_in_box(surface: SurfaceMesh, box: GridBox, band: float | None = Non
     band : float or None
         For fine grids: distances are computed only within [-band, band], and cut there [m]. A
         hierarchy of coarser grids excludes the points that are farther away.
+
+    Examples
+    --------
+    >>> box = av.shapes.padded_box([liver], 15e-3, 30e-3)
+    >>> av.shapes.distance_in_box(liver, box).values.shape == box.shape
+    True
     """
     origin = np.array(box.origin)
     if band is None:
@@ -230,6 +259,13 @@ def reinitialize(grid: DistanceGrid) -> DistanceGrid:
     exact distance to the marching-cubes surface. The sign is taken from the given values.
 
     Raises SurfaceError if the grid has no zero surface.
+
+    Examples
+    --------
+    >>> grid = av.shapes.distance_grid(liver, spacing=15e-3, padding=30e-3)
+    >>> again = av.shapes.reinitialize(grid)
+    >>> np.array_equal(again.values < 0, grid.values < 0)
+    True
     """
     # Not closed at the border of the grid, where the organ continues.
     zero = _in_space(grid, *march(grid.values), "zero surface")
@@ -246,6 +282,13 @@ def dice(one: DistanceGrid, other: DistanceGrid) -> float:
     The larger of two signed distances is a level set of the intersection.
 
     Raises SurfaceError if the grids lie on different boxes or hold no organ.
+
+    Examples
+    --------
+    >>> box = av.shapes.padded_box([liver], 15e-3, 30e-3)
+    >>> grid = av.shapes.distance_in_box(liver, box)
+    >>> av.shapes.dice(grid, grid)
+    1.0
     """
     if one.box != other.box:
         raise SurfaceError("dice: the grids lie on different boxes; compute both on one GridBox")
@@ -261,6 +304,12 @@ def isosurface(grid: DistanceGrid, name: str = "isosurface") -> SurfaceMesh:
     The surface is closed along the grid's border, where the organ is cut off.
 
     Raises SurfaceError if the grid has no zero surface.
+
+    Examples
+    --------
+    >>> grid = av.shapes.distance_grid(liver, spacing=15e-3, padding=30e-3)
+    >>> abs(av.shapes.isosurface(grid).volume - liver.volume) < 0.05 * liver.volume
+    True
     """
     outside = np.abs(grid.values).max() + grid.spacing
     index, faces = march(np.pad(grid.values, 1, constant_values=outside))

@@ -66,6 +66,11 @@ def phantom_liver(spacing: float = 7e-3) -> SurfaceMesh:
     ------
     SurfaceError
         If the spacing is too coarse for the notch or needlessly fine.
+
+    Examples
+    --------
+    >>> 1.3e-3 < av.phantom_liver(12e-3).volume < 1.7e-3  # [m^3]
+    True
     """
     if not 1e-3 <= spacing <= 12e-3:
         raise SurfaceError(f"phantom: spacing {spacing:.3g} m; choose 0.001 to 0.012 m")
@@ -142,6 +147,12 @@ class ShapeMap:
         Amplitudes [m] of b_i(x) = a (1 - cos(2 pi x_j / L)) for the pairs (i, j) of axes. The map
         is smooth and not affine. It is one-to-one if the two amplitudes of each i together stay
         below L / (2 pi).
+
+    Examples
+    --------
+    >>> (one,) = av.shapes.population(1, seed=0)
+    >>> one.moved(liver).faces.shape == liver.faces.shape
+    True
     """
 
     stretch: FloatArray
@@ -180,6 +191,13 @@ def population(n: int, seed: int, bend: float = 0.0) -> list[ShapeMap]:
     ----------
     bend : float
         Largest amplitude of each bend [m].
+
+    Examples
+    --------
+    >>> maps = av.shapes.population(5, seed=0, bend=5e-3)
+    >>> organs = [one.moved(liver) for one in maps]
+    >>> len(organs)
+    5
     """
     if not 0.0 <= bend < BEND_LENGTH / (4 * np.pi):
         raise SurfaceError(

@@ -64,6 +64,11 @@ class SurfaceMesh:
     ------
     SurfaceError
         If the arrays are empty, not finite or do not fit each other.
+
+    Examples
+    --------
+    >>> 1e-3 < av.SurfaceMesh(liver.vertices, liver.faces, name="mine").volume < 2e-3  # [m^3]
+    True
     """
 
     vertices: FloatArray
@@ -161,8 +166,7 @@ def read_surface(
     axes : str, array_like or None
         Directions of the file's +x, +y, +z ("RAS", "LPS", "RIA", ...), or a rigid (4, 4) matrix
         from the file's coordinates to RAS in the file's unit. None takes them from the header
-        (``SPACE=LPS``, as 3D Slicer writes it), or RAS without one. Axes that are given override
-        the header, with a notice.
+        (``SPACE=LPS``), or RAS without one. Given axes override the header, with a notice.
     label : int or str or None
         Label of a label map: its number, its name in a ``.seg.nrrd``, or several with commas. None
         takes the only one.
@@ -177,6 +181,11 @@ def read_surface(
     SurfaceError
         If the file is missing or unreadable, has no triangles, points that are not finite, an open
         surface or more than one organ, or if the size is implausible.
+
+    Examples
+    --------
+    >>> len(av.read_surface("liver.stl", unit="m").faces) == len(liver.faces)
+    True
     """
     path = Path(path)
     scale = _metres_per(unit)

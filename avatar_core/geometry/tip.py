@@ -33,6 +33,12 @@ class Jaw:
     ------
     SceneError
         For a number out of its range.
+
+    Examples
+    --------
+    >>> tip = av.Tip("sphere", 5e-3, grasp=av.Jaw(radius=3e-3, slip=4.0))
+    >>> av.Scene(tools=(av.Tool("left", tip),)).effect("grasp") is not None
+    True
     """
 
     radius: float = quantity("m", 5e-4, 20e-3, "radius of the disc that is held", 3e-3)
@@ -60,6 +66,11 @@ class Tip:
     ------
     SceneError
         If the shape is unknown, a number is missing, out of its range or not used by the shape.
+
+    Examples
+    --------
+    >>> av.Tip("sphere", 4e-3).offset, av.Tip("flat", 4e-3).offset  # of the centre [m]
+    (0.004, 0.0)
     """
 
     shape: Shape = "sphere"

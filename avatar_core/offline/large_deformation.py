@@ -64,6 +64,11 @@ class LargeRule:
         Largest number of modes of a region.
     mode_tolerance : float
         Mean relative L2 error of these modes for the displacement at the reach.
+
+    Examples
+    --------
+    >>> av.OrganOptions(large="neo-hookean", large_rule=av.LargeRule(max_push=10e-3)).large
+    'neo-hookean'
     """
 
     max_push: float = 20e-3

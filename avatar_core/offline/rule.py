@@ -41,6 +41,11 @@ class BuildRule:
         least 30 load positions.
     contact_support : float
         Reach of the contact near field, in patch radii.
+
+    Examples
+    --------
+    >>> av.OrganOptions(rule=av.BuildRule(max_modes=60)).rule.tolerance
+    0.006
     """
 
     tolerance: float = 0.006

@@ -59,6 +59,13 @@ class SupportOption:
     ------
     MaterialError
         For a stiffness that no support has, or a name that no coordinate can have.
+
+    Examples
+    --------
+    >>> av.SupportOption("falciform", 1e5).stiffness  # [N/m^3]
+    100000.0
+    >>> print(av.SupportOption.parse("bare_area=1e5:1e9").coordinate.name)
+    support.bare_area
     """
 
     name: str

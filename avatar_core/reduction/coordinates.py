@@ -63,6 +63,12 @@ class Coordinate:
     ------
     CoordinateError
         For an unknown name or a range that is empty or impossible.
+
+    Examples
+    --------
+    >>> poisson = av.Coordinate("poisson", 0.40, 0.48)
+    >>> poisson.nodes.round(3)
+    array([0.4 , 0.48])
     """
 
     name: str

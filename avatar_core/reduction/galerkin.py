@@ -109,6 +109,13 @@ def solve_galerkin(
     SeparatedField
         X, shape (n_dofs, r), and Y, shape (n_loads, r), r the dimension of the space. Y Y^T is the
         compliance between the loads.
+
+    Examples
+    --------
+    >>> U = np.linalg.solve(K.toarray(), F)
+    >>> there = av.mor.solve_galerkin(K, F, U[:, ::2])
+    >>> np.allclose(there.evaluate()[:, ::2], U[:, ::2])
+    True
     """
     work = basis.T @ operator_of(operator).apply(basis)
     size = np.sqrt(np.diagonal(work))

@@ -35,6 +35,12 @@ class SparseOperator:
     ------
     ConvergenceError
         If the matrix is not square and symmetric.
+
+    Examples
+    --------
+    >>> operator = av.mor.SparseOperator(K)
+    >>> np.allclose(operator.apply(operator.solve(F)), F)
+    True
     """
 
     def __init__(self, matrix: sp.spmatrix) -> None:

@@ -56,6 +56,12 @@ class EnrichmentReport:
         Relative change of the energy that R S captures, in the last sweep.
     energy_error : float
         sqrt(residual energy / total energy) after the enrichment.
+
+    Examples
+    --------
+    >>> found = av.mor.solve_pgd(av.mor.LoadProblem(K, F), av.mor.PGDRule(3, 0.0, block=1))
+    >>> [report.modes for report in found.history]
+    [1, 1, 1]
     """
 
     status: EnrichmentStatus
@@ -81,6 +87,11 @@ class PGDRule:
         Largest number of alternating sweeps per enrichment.
     sweep_tolerance : float
         Relative change of the captured energy below which an enrichment has converged.
+
+    Examples
+    --------
+    >>> av.mor.PGDRule(max_modes=20, tolerance=1e-3, block=1).max_sweeps  # block 1: the paper's
+    5
     """
 
     max_modes: int
@@ -100,6 +111,12 @@ class PGDSolution:
         X, or as the problem writes it.
     load : ndarray, shape (n_loads, rank)
         Y.
+
+    Examples
+    --------
+    >>> found = av.mor.solve_pgd(av.mor.LoadProblem(K, F), av.mor.PGDRule(5, 0.0))
+    >>> np.allclose(found.space.T @ (K @ found.space), np.eye(5))
+    True
     """
 
     space: np.ndarray
@@ -205,6 +222,12 @@ class LoadProblem:
         Weight of each load in the norm over the loads. The default is 1.
     energy : ndarray, shape (n_loads,), optional
         f . K^-1 f of each load. The default solves every load once for it.
+
+    Examples
+    --------
+    >>> problem = av.mor.LoadProblem(K, F)  # sparse K, and one load a column of F
+    >>> problem.shape == F.shape
+    True
     """
 
     operator: Operator | sp.spmatrix
@@ -301,6 +324,13 @@ def solve_pgd(
     ConvergenceError
         If the right-hand side is zero, so that no relative error exists, or modes do not come out
         orthonormal.
+
+    Examples
+    --------
+    >>> found = av.mor.solve_pgd(av.mor.LoadProblem(K, F), av.mor.PGDRule(12, 1e-9))
+    >>> U = np.linalg.solve(K.toarray(), F)
+    >>> np.allclose(found.space @ found.load.T, U, atol=1e-6)
+    True
     """
     if not problem.weights @ problem.energy > 0:
         raise ConvergenceError("all loads are zero: there is nothing to separate")

@@ -38,6 +38,13 @@ class RegionModes(NamedTuple):
         Z, each with a peak of 1.
     load : ndarray, shape (n positions of the region, n_loads, n)
         W.
+
+    Examples
+    --------
+    >>> region = av.mor.regions_of(np.arange(12.0)[:, None] * np.eye(3)[0], 2)
+    >>> modes, _ = av.mor.separate_regions(region, F[:, :, None], av.mor.RegionalRule(0.0, 0.0, 3))
+    >>> [one.space.shape[1] for one in modes]
+    [3, 3]
     """
 
     space: FloatArray
@@ -56,6 +63,11 @@ class RegionalRule:
         Relative L2 error of the region's worst load.
     most : int
         Largest number of modes of a region.
+
+    Examples
+    --------
+    >>> av.mor.RegionalRule(tolerance=0.01, worst=0.05, most=20).most
+    20
     """
 
     tolerance: float
@@ -64,7 +76,13 @@ class RegionalRule:
 
 
 def regions_of(centers: FloatArray, n_regions: int) -> IntArray:
-    """Return compact regions of load positions, by k-means, shape (n_positions,) int32."""
+    """Return compact regions of load positions, by k-means, shape (n_positions,) int32.
+
+    Examples
+    --------
+    >>> av.mor.regions_of(v.surface.centers, 4).max()
+    3
+    """
     n_regions = max(1, min(n_regions, len(centers)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a region may come out empty: it is dropped
@@ -105,6 +123,14 @@ def separate_regions(
     errors : ndarray, shape (most + 1, n_positions, n_loads)
         Relative L2 error of each load by number of its region's modes; constant beyond the modes
         kept.
+
+    Examples
+    --------
+    >>> region = av.mor.regions_of(np.arange(12.0)[:, None] * np.eye(3)[0], 2)
+    >>> rule = av.mor.RegionalRule(tolerance=0.0, worst=0.0, most=3)
+    >>> modes, errors = av.mor.separate_regions(region, F[:, :, None], rule)
+    >>> errors.shape, errors[3].max() < errors[1].max()
+    ((4, 12, 1), True)
     """
     parts = []
     at: Callable[[IntArray], FloatArray] = (

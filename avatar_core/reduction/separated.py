@@ -17,6 +17,12 @@ class SeparatedField:
         X_k at the degrees of freedom in space.
     load : ndarray, shape (n_loads, rank)
         Y_k at the loads (position and direction).
+
+    Examples
+    --------
+    >>> field = av.mor.SeparatedField(space=np.ones((4, 2)), load=np.ones((3, 2)))
+    >>> field.evaluate().shape, field.truncate(1).rank
+    ((4, 3), 1)
     """
 
     space: np.ndarray

@@ -39,6 +39,13 @@ def pod(
     ------
     ConvergenceError
         If all snapshots are zero, or a number is not finite.
+
+    Examples
+    --------
+    >>> U = np.linalg.solve(K.toarray(), F)
+    >>> best = av.mor.pod(U, rank=12)
+    >>> np.allclose(best.evaluate(), U)
+    True
     """
     u = np.asarray(snapshots, float)
     if u.ndim != 2 or not np.isfinite(u).all() or not u.any():

@@ -47,6 +47,12 @@ class Cloud:
         Unit of length that was applied.
     notices : tuple[str, ...]
         Points that were left out, one line each.
+
+    Examples
+    --------
+    >>> cloud = av.Cloud(v.surface.centers, name="camera")
+    >>> cloud.extent < 0.3
+    True
     """
 
     points: FloatArray
@@ -120,6 +126,12 @@ def read_cloud(path: str | Path, unit: str = "mm", axes: str | ArrayLike | None 
     ------
     RegistrationError, SurfaceError
         For a file that cannot be read, too few points, points that are not finite.
+
+    Examples
+    --------
+    >>> np.savetxt("cloud.xyz", v.surface.centers)
+    >>> av.read_cloud("cloud.xyz", unit="m").points.shape[1]
+    3
     """
     path = Path(path)
     if unit not in METRES:

@@ -77,6 +77,12 @@ class RegistrationRule:
         Numbers of rigid iterations, and of all iterations at most.
     rescaled : tuple[int, ...]
         Steps after the rigid ones at which the scales are sought.
+
+    Examples
+    --------
+    >>> rule = av.RegistrationRule(noise=0.5e-3, turn=0.0, shift=0.0)  # it deformed alone
+    >>> rule.within
+    0.005
     """
 
     noise: float = 1e-3

@@ -101,6 +101,14 @@ class Registered:
         Reasons why the model does not explain the cloud, one line each; empty if it does.
     notices : tuple[str, ...]
         Further notices, one line each.
+
+    Examples
+    --------
+    >>> moved = v.mesh.vertices + v.displacement_at(point, 3.0)
+    >>> seen = moved[np.unique(v.mesh.boundary_faces[v.regions.accessible])]
+    >>> found = av.register(v, seen)
+    >>> found.rms < 2e-3, found.target_at([0.0, 0.03, 0.0]).place.shape
+    (True, (3,))
     """
 
     vademecum: Vademecum
@@ -288,6 +296,14 @@ def register(
     ------
     RegistrationError
         If the cloud cannot be one of this organ.
+
+    Examples
+    --------
+    >>> moved = v.mesh.vertices + v.displacement_at(point, 3.0)
+    >>> seen = moved[np.unique(v.mesh.boundary_faces[v.regions.accessible])]
+    >>> found = av.register(v, seen, av.RegistrationRule(turn=0.0, shift=0.0))
+    >>> np.abs(found.place - moved).max() < 5e-3, found.interval.shape == (len(moved),)
+    (True, True)
     """
     rule = rule or RegistrationRule()
     cloud = cloud if isinstance(cloud, Cloud) else Cloud(np.asarray(cloud, float))

@@ -48,6 +48,12 @@ def export(
     ------
     LoadError, StorageError
         For a point off the accessible surface, for another suffix, a missing folder or full disk.
+
+    Examples
+    --------
+    >>> mesh = av.export(v, "pressed.vtu", point, 2.0)  # for ParaView
+    >>> "tetra" in mesh.cells_dict
+    True
     """
     where = vademecum.surface.centers[middle_of_access(vademecum)] if point is None else point
     mesh = organ_mesh(vademecum, where, force, n_modes)

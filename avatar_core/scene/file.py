@@ -80,7 +80,14 @@ def scene_path(name: str) -> Path:
 
 
 def read_scene(path: str | Path) -> Scene:
-    """Read a scene; see :func:`parse_scene`. Files of Prony terms must lie in the same folder."""
+    """Read a scene; see :func:`parse_scene`. Files of Prony terms must lie in the same folder.
+
+    Examples
+    --------
+    >>> _ = open("touch.yaml", "w").write("{name: touch, effects: {friction: {}}}")
+    >>> av.read_scene("./touch.yaml").effect("friction").static
+    0.4
+    """
     path = Path(path)
     return parse_scene(read_text(path), str(path), path.parent)
 

@@ -45,6 +45,11 @@ class Tool:
     ------
     SceneError
         For a name that cannot be part of a topic's name.
+
+    Examples
+    --------
+    >>> av.Tool("left", av.Tip("sphere", 4e-3)).name
+    'left'
     """
 
     name: str = "tool"
@@ -100,6 +105,12 @@ class Scene:
     ------
     SceneError
         For a value out of range, or a contradiction.
+
+    Examples
+    --------
+    >>> scene = av.Scene(young_modulus=5e3, effects=(av.effects.Friction(static=0.3, kinetic=0.2),))
+    >>> scene.effect("friction").static
+    0.3
     """
 
     name: str = "palpation"

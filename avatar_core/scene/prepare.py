@@ -129,6 +129,14 @@ def prepare(
     AvatarError
         For a scene that the vademecum does not support. Also for a budget that no detail meets,
         with the nearest two.
+
+    Examples
+    --------
+    >>> model = av.prepare(v, av.Scene(effects=()))
+    >>> data = model.data()
+    >>> status = av.step(model, data, outside)
+    >>> data.out.force[0]
+    array([0., 0., 0.])
     """
     spec = scene_spec(vademecum, scene) if scene else default_spec(vademecum)
     detail = choose(spec.curve, budget).detail if budget else spec.finest

@@ -169,6 +169,16 @@ class LLE:
     References
     ----------
     Gonzalez, Cueto & Chinesta (2015), Eq. 15 and 16; Roweis & Saul (2000), Science 290:2323.
+
+    Examples
+    --------
+    >>> X = np.random.default_rng(0).standard_normal((40, 2)) @ np.ones((2, 9))
+    >>> X += np.arange(40)[:, None] * np.arange(9)
+    >>> lle = av.shapes.LLE(n_neighbors=6, n_components=2)
+    >>> lle.fit_transform(X).shape
+    (40, 2)
+    >>> np.array_equal(lle.transform(X[:3]), lle.embedding_[:3])
+    True
     """
 
     vectors_: tuple[FloatArray, ...]

@@ -48,6 +48,11 @@ class Template:
         Name of the organ it was made from.
     regions : Regions
         Clamp and accessible faces over ``mesh.boundary_faces``.
+
+    Examples
+    --------
+    >>> av.shapes.Template.of(liver, n_vertices=300).name
+    'phantom'
     """
 
     name: str
@@ -97,6 +102,11 @@ class TemplateRule:
         Stiffness below which the nearest point is sought on the target's triangles.
     rotation_spread : float
         Standard deviation of the rotation between patients lying alike [deg].
+
+    Examples
+    --------
+    >>> av.shapes.TemplateRule(tolerance=0.5e-3).n_stages
+    14
     """
 
     first_stiffness: float = 1.0
@@ -213,6 +223,13 @@ class Registration:
     converged : bool
         Whether the alignment converged and the tolerance was met. If not, the result is still
         within the larger distances of the rule.
+
+    Examples
+    --------
+    >>> template = av.shapes.Template.of(liver, 300)
+    >>> found = av.shapes.register_template(template, liver, rough)
+    >>> found.mesh.tets is template.mesh.tets
+    True
     """
 
     template: Template
@@ -246,6 +263,14 @@ def register_template(
     RegistrationError
         If the target is not an organ of the template's kind: its size differs too much, or
         tetrahedra would flatten before its surface is reached.
+
+    Examples
+    --------
+    >>> (change,) = av.shapes.population(1, seed=0)
+    >>> template = av.shapes.Template.of(liver, 300)
+    >>> found = av.shapes.register_template(template, change.moved(liver), rough)
+    >>> found.quality.mean_distance < 2e-3  # [m]
+    True
     """
     rule = rule or TemplateRule()
     target = sample_target(surface, 3 * rule.n_samples)

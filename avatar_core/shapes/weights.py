@@ -47,6 +47,13 @@ class Barycenter:
         Number of the member that equals x and has weight 1; None if there is none.
     notices : tuple[str, ...]
         Differences of the result from the request, one line each.
+
+    Examples
+    --------
+    >>> X = np.eye(3)
+    >>> found = av.shapes.barycenter(X, X.mean(axis=0), n_neighbors=3)
+    >>> found.combine([1.0, 2.0, 3.0]).round(6)
+    2.0
     """
 
     neighbors: IntArray
@@ -157,6 +164,13 @@ def barycenter(
         Whether weights are non-negative; regularization is then not used.
     leave_out : Collection[int]
         Members that get no weight, e.g. other scans of the same patient.
+
+    Examples
+    --------
+    >>> X = np.random.default_rng(0).standard_normal((6, 40))
+    >>> found = av.shapes.barycenter(X, 0.7 * X[0] + 0.3 * X[1], n_neighbors=6)
+    >>> found.weights[:2].round(3)
+    array([0.7, 0.3])
     """
     x = checked_vector(point, vectors)
     require_regularization(regularization)
@@ -203,6 +217,13 @@ def kriging(
     point : ndarray, shape (D,)
     n_neighbors : int
         Number of nearest anatomies that get weights.
+
+    Examples
+    --------
+    >>> X = np.random.default_rng(0).standard_normal((30, 40))
+    >>> found = av.shapes.kriging(X, X.mean(axis=0), n_neighbors=20)
+    >>> found.weights.sum().round(6), found.combine(X).shape
+    (1.0, (40,))
     """
     found = barycenter(vectors, point, n_neighbors, leave_out=leave_out)
     if found.member is not None:

@@ -81,6 +81,11 @@ class TouchErrors:
         Error of the mesh relative to the force, the same for all samples.
     extent : float
         Error of the mesh for the extent of a tumour or support, relative to contrast or stiffness.
+
+    Examples
+    --------
+    >>> av.uncertainty.TouchErrors(sensor=0.05).depth  # [m]
+    0.0003
     """
 
     sensor: float = 0.02
@@ -183,6 +188,14 @@ class Calibration:
         Misfit of each touch over its standard deviation.
     probability : float
         Probability that so bad a fit comes by chance.
+
+    Examples
+    --------
+    >>> from scipy.stats import norm
+    >>> known = {"young": av.uncertainty.Lognormal(5e3, 1.5)}
+    >>> found = av.Calibration(known, ("young",), np.zeros(1), np.eye(1), *np.zeros((2, 9)), 0.5)
+    >>> found.value("young"), found.explained
+    (5000.0, True)
     """
 
     known: Mapping[str, Distribution]
@@ -263,6 +276,20 @@ def calibrate(
         If fewer than three touches meet the organ.
     CoordinateError
         If the vademecum has no such parameter.
+
+    Examples
+    --------
+    >>> model = av.prepare(v.at(young=6e3), av.Scene(effects=()))
+    >>> data, tips, forces = model.data(), [], []
+    >>> for j in places:  # four touches, each from outside
+    ...     for depth in np.linspace(-6e-3, 4e-3, 60):
+    ...         tips.append(v.surface.centers[j] + (5e-3 - depth) * v.surface.normals[j])
+    ...         status = av.step(model, data, tips[-1])
+    ...         forces.append(data.out.force[0].copy())
+    >>> found = av.calibrate(v, tips, forces)
+    >>> low, high = found.interval("young")
+    >>> low < 6e3 < high
+    True
     """
     size = np.asarray(forces, float)
     size = np.linalg.norm(size, axis=1) if size.ndim == 2 else size

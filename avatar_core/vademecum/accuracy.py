@@ -95,6 +95,12 @@ class Budget:
     ------
     AccuracyError
         For a limit that is not positive, or an unknown quantity.
+
+    Examples
+    --------
+    >>> budget = av.Budget(tolerance=0.1, deadline=1.0)  # 10 % in the mean, within 1 s
+    >>> av.prepare(v, budget=budget).n_modes <= v.n_modes
+    True
     """
 
     tolerance: float

@@ -78,6 +78,11 @@ class Certificate:
         Errors of real tips against resolved contact, if asked for.
     curve : AccuracyCurve or None
         The same errors for coarser details of the displacement, and the time of a step.
+
+    Examples
+    --------
+    >>> 0.0 < v.certificate.l2_mean < v.certificate.l2_worst < 0.2
+    True
     """
 
     l2_mean: float

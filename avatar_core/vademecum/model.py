@@ -73,6 +73,17 @@ class Vademecum:
         Mass and weight in the global modes.
     display : Display or None
         Finer surface, and structures inside. None for the boundary of the mesh alone.
+
+    Examples
+    --------
+    >>> u = v.displacement_at(point, 2.0)  # 2 N along the inward normal
+    >>> u.shape == v.mesh.vertices.shape
+    True
+    >>> v.displacement_at(v.surface.centers[:5], [1.0, 1.0, 2.0, 2.0, 3.0]).shape[0]
+    5
+    >>> stiff = v.at(young=10e3, poisson=0.45)
+    >>> stiff.material.poisson_ratio, v.ranges["poisson"]
+    (0.45, (0.4, 0.48))
     """
 
     name: str

@@ -130,6 +130,12 @@ def save_vademecum(vademecum: Vademecum, path: str | Path) -> str:
     ------
     StorageError
         If the folder does not exist or the disk is full; nothing is left behind.
+
+    Examples
+    --------
+    >>> file_hash = av.save(v, "copy.h5")
+    >>> av.load("copy.h5").id == file_hash
+    True
     """
     arrays, attributes = _arrays(vademecum), _attributes(vademecum)
     replace_file(Path(path), arrays, attributes, packed=True)
@@ -145,6 +151,11 @@ def load_vademecum(path: str | Path) -> Vademecum:
     ------
     StorageError
         For a missing, truncated, altered or foreign file, and for one of another schema.
+
+    Examples
+    --------
+    >>> av.load("liver.h5").name
+    'phantom'
     """
     path = Path(path)
     try:

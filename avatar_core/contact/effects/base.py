@@ -62,6 +62,11 @@ class Effect(ABC):
     ------
     SceneError
         For a number out of its range, or numbers that contradict each other.
+
+    Examples
+    --------
+    >>> isinstance(av.effects.Friction(), av.effects.Effect)
+    True
     """
 
     name: ClassVar[str]

@@ -32,7 +32,13 @@ from avatar_core.reduction.near_field import find_block
 
 @dataclass(frozen=True)
 class Friction(Effect):
-    """Coulomb friction with stick and slip."""
+    """Coulomb friction with stick and slip.
+
+    Examples
+    --------
+    >>> av.Scene(effects=(av.effects.Friction(static=0.4, kinetic=0.3),)).name
+    'palpation'
+    """
 
     name: ClassVar[str] = "friction"
     text: ClassVar[str] = "tips stick and slip: |F_t| <= mu F_n"

@@ -54,7 +54,13 @@ _LEAST_ACROSS = 0.05  # part of the patch's compliance along the surface that a 
 
 @dataclass(frozen=True)
 class Grasp(Effect):
-    """Jaws hold tissue; each tool's tip has its own radius and slip."""
+    """Jaws hold tissue; each tool's tip has its own radius and slip.
+
+    Examples
+    --------
+    >>> av.effects.Grasp().name
+    'grasp'
+    """
 
     name: ClassVar[str] = "grasp"
     text: ClassVar[str] = "jaws that close hold tissue, pull it, and let go where it slips"

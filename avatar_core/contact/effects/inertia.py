@@ -34,7 +34,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Inertia(Effect):
-    """The organ's mass: it vibrates after release."""
+    """The organ's mass: it vibrates after release.
+
+    Examples
+    --------
+    >>> av.effects.Inertia(density=1060.0, damping=0.2).damping
+    0.2
+    """
 
     name: ClassVar[str] = "inertia"
     text: ClassVar[str] = "the organ has mass and swings"

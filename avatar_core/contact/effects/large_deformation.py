@@ -28,7 +28,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LargeDeformation(Effect):
-    """Large deformation: the response depends nonlinearly on the magnitude of the force."""
+    """Large deformation: the response depends nonlinearly on the magnitude of the force.
+
+    Examples
+    --------
+    >>> av.effects.LargeDeformation().name
+    'large_deformation'
+    """
 
     name: ClassVar[str] = "large_deformation"
     text: ClassVar[str] = "the response bends with the depth of a push or pull"

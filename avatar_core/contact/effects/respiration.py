@@ -21,7 +21,13 @@ from avatar_core.contact.effects.base import Effect, Ground, direction
 
 @dataclass(frozen=True)
 class Respiration(Effect):
-    """The organ and its clamp move with the breath; the tool stays in the world's frame."""
+    """The organ and its clamp move with the breath; the tool stays in the world's frame.
+
+    Examples
+    --------
+    >>> av.effects.Respiration(period=5.0, amplitude=10e-3).axis
+    (0.0, 0.0, -1.0)
+    """
 
     name: ClassVar[str] = "respiration"
     text: ClassVar[str] = "the organ moves with the breath"

@@ -23,7 +23,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SelfWeight(Effect):
-    """The organ deforms under its own weight."""
+    """The organ deforms under its own weight.
+
+    Examples
+    --------
+    >>> av.effects.SelfWeight(direction=(0.0, -2.0, 0.0)).direction
+    (0.0, -1.0, 0.0)
+    """
 
     name: ClassVar[str] = "self_weight"
     text: ClassVar[str] = "the organ sags under gravity"

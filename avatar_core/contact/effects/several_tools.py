@@ -38,7 +38,14 @@ WIDTH = 0.36  # w over a tip's radius: two in one place give way less than a con
 
 @dataclass(frozen=True)
 class SeveralTools(Effect):
-    """More than one tool touches at once, coupled through the organ."""
+    """More than one tool touches at once, coupled through the organ.
+
+    Examples
+    --------
+    >>> tools = av.Tool("left"), av.Tool("right")
+    >>> len(av.Scene(tools=tools, effects=(av.effects.SeveralTools(),)).tools)
+    2
+    """
 
     name: ClassVar[str] = "several_tools"
     text: ClassVar[str] = "tools are coupled through the organ"

@@ -40,7 +40,14 @@ _UPRIGHT = 1e-9  # sine below which a punch does not lean
 
 @dataclass(frozen=True)
 class Tilt(Effect):
-    """Flat punches lean by their poses, and are righted by a torque."""
+    """Flat punches lean by their poses, and are righted by a torque.
+
+    Examples
+    --------
+    >>> punch = av.Tool("punch", av.Tip("flat", 5e-3))
+    >>> len(av.Scene(tools=(punch,), effects=(av.effects.Tilt(),)).effects)
+    1
+    """
 
     name: ClassVar[str] = "tilt"
     text: ClassVar[str] = "a flat punch that leans touches with its edge and is righted by a torque"

@@ -15,7 +15,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Tumour(Effect):
-    """The tumour is stiffer, or softer, than the organ around it."""
+    """The tumour is stiffer, or softer, than the organ around it.
+
+    Examples
+    --------
+    >>> av.effects.Tumour(contrast=5.0).contrast
+    5.0
+    """
 
     name: ClassVar[str] = "tumour"
     text: ClassVar[str] = "the tumour has a stiffness of its own"

@@ -43,6 +43,11 @@ class Viscoelasticity(Effect):
     """Relaxation by a Prony series: E(t) / E = 1 - sum_i g_i (1 - exp(-t / tau_i)).
 
     E is the vademecum's Young's modulus, which holds for fast contact; Poisson's ratio is constant.
+
+    Examples
+    --------
+    >>> av.effects.Viscoelasticity(g=(0.3, 0.2), tau=(0.1, 2.0)).tau  # [s]
+    (0.1, 2.0)
     """
 
     name: ClassVar[str] = "viscoelasticity"
