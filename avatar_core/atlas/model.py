@@ -22,7 +22,7 @@ from avatar_core.shapes.weights import SAME, Vectors
 
 Item = TypeVar("Item")
 
-# More neighbours than 45 of 64 livers change no error (`avatar study transport`).
+# More neighbors than 45 of 64 livers change no error (`avatar study transport`).
 MOST_NEIGHBORS = 64
 
 

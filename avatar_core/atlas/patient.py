@@ -1,6 +1,6 @@
 """A new patient's vademecum from a base of anatomies, at three fidelities.
 
-``interpolated`` combines the neighbours' responses node by node on the registered template (Eq.
+``interpolated`` combines the neighbors' responses node by node on the registered template (Eq.
 18): nothing is meshed or solved. ``reduced`` uses their load functions to span a Galerkin space on
 the patient's own mesh, and enriches it. ``solved`` is the full build. The last two use the
 patient's mesh, and the clamp and accessible region transferred from the template. Supports may hold
@@ -60,7 +60,7 @@ Fidelity = Literal["interpolated", "reduced", "solved"]
 
 _CERTIFIED = {"interpolated": 24, "reduced": 24, "solved": 200}  # each is a fine solution
 RESIDUAL_SUPPORT = 2.0  # support of interpolated residual compliance, in patch radii
-_FAR_HULL = 0.5  # hull distance over the mean distance to the neighbours, above which to warn
+_FAR_HULL = 0.5  # hull distance over the mean distance to the neighbors, above which to warn
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ class Patient:
         Vademecum of the patient.
     fidelity : str
         "interpolated", "reduced" or "solved".
-    neighbours : tuple of str
+    neighbors : tuple of str
         Names of the anatomies that were used, nearest first.
     weights : ndarray, shape (n,)
         Their weights.
@@ -186,7 +186,7 @@ class Patient:
 
     vademecum: Vademecum
     fidelity: Fidelity
-    neighbours: tuple[str, ...]
+    neighbors: tuple[str, ...]
     weights: np.ndarray
     barycenter: Barycenter
     estimates: tuple[GalerkinErrorEstimate, ...]
@@ -443,7 +443,7 @@ def _patient(
     return Patient(
         vademecum=vademecum,
         fidelity=fidelity,
-        neighbours=tuple(base.names[j] for j in weights.neighbors),
+        neighbors=tuple(base.names[j] for j in weights.neighbors),
         weights=weights.weights,
         barycenter=weights,
         estimates=estimates,
@@ -470,7 +470,7 @@ def _warnings(
         lines.append(f"the patient is {base.names[weights.member]} of the base")
     elif away > _FAR_HULL:
         lines.append(
-            f"the patient lies outside the hull of the neighbours, by {away:.2g} of the mean "
+            f"the patient lies outside the hull of the neighbors, by {away:.2g} of the mean "
             "distance to them; trust 'interpolated' less, or add similar anatomies"
         )
     if fidelity != "interpolated" and not vademecum.convergence.converged:

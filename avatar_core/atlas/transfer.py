@@ -33,7 +33,7 @@ from avatar_core.shapes.registration import Registration
 from avatar_core.shapes.weights import DEFAULT_REGULARIZATION, Barycenter, barycenter, kriging
 
 Weighting = Literal["kriging", "lle-template", "lle-grid", "lle-paper"]
-# Neighbours and ridge of LLE: the paper's (Sec. 3.3), and those with the least leave-one-out error
+# Neighbors and ridge of LLE: the paper's (Sec. 3.3), and those with the least leave-one-out error
 # of 64 livers (`avatar study transport`).
 LLE_SETTINGS: dict[str, tuple[int, float]] = {
     "lle-template": (40, 3e-4),
@@ -61,7 +61,7 @@ def patient_weights(
     weighting : Weighting
         "kriging" (:func:`kriging`) and "lle-template" (Eq. 15) use the centred registered vertices.
         "lle-grid" is Eq. 15 on the distances at the common grid. "lle-paper" is the paper's form of
-        it, with ten neighbours and almost no ridge.
+        it, with ten neighbors and almost no ridge.
     n_neighbors : int or None
         k; None for the 64 nearest, 40 with "lle-template" and 10 with "lle-paper".
     leave_out : Collection[int]

@@ -138,10 +138,10 @@ def patient(
 
 
 def _show_origin(found: Patient) -> None:
-    """Print neighbours, weights and time, and notices to standard error."""
+    """Print neighbors, weights and time, and notices to standard error."""
     nearest = ", ".join(
         f"{name} {weight:+.3f}"
-        for name, weight in zip(found.neighbours[:5], found.weights[:5], strict=True)
+        for name, weight in zip(found.neighbors[:5], found.weights[:5], strict=True)
     )
     more = f" and {len(found.weights) - 5} more" if len(found.weights) > 5 else ""
     print(f"  from {nearest}{more}; sum |w| {found.barycenter.absolute_sum:.2f}")

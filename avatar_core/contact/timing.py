@@ -32,7 +32,7 @@ def timed(
     """Return the curve with processor times of steps on this machine, one tool 5 mm deep.
 
     Each point has the median over rounds of its p50 and p99. All points take their turn in a round.
-    A neighbour that disturbs this machine's memory for a second then disturbs one round of each
+    A neighbor that disturbs this machine's memory for a second then disturbs one round of each
     point, not all rounds of some.
     """
     path = slide(vademecum, _TIP.offset, _DEPTH, _STEPS * 1e-4)[:, None]

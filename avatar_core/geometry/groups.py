@@ -86,7 +86,7 @@ def _covered(mesh: TetMesh, points: np.ndarray) -> np.ndarray:
     angle = np.arctan2(*(np.einsum("fqkd,fd->fqk", arm, axis) for axis in (across, along)))
     angle.sort(axis=2)
     gap = np.diff(np.concatenate([angle, angle[:, :, :1] + 2.0 * np.pi], axis=2)).max(axis=2)
-    spacing = np.median(tree.query(points, k=_FEW)[0][:, -1])  # to the third neighbour
+    spacing = np.median(tree.query(points, k=_FEW)[0][:, -1])  # to the third neighbor
     reach = max(_REACH * spacing, _OFF * mesh.mean_surface_edge)
     is_between = (gap < _HALF_TURN) & (distance[:, :, 0] < reach)
     return np.asarray(is_between.mean(axis=1) >= 0.5)

@@ -105,7 +105,7 @@ def _whole(values: NDArray[Any], name: str) -> tuple[NDArray[np.int32], tuple[st
     if worst > _OFF:
         raise SurfaceError(
             f"{name}: values like {example:.3g} are not labels; give the segmentation, "
-            "resampled without interpolation (nearest neighbour)"
+            "resampled without interpolation (nearest neighbor)"
         )
     if worst <= _EXACT:
         return labels, ()

@@ -40,7 +40,7 @@ class GridBox:
     origin : tuple[float, float, float]
         Lowest corner [m].
     spacing : float
-        Distance of neighbouring points, the same along x, y, z [m].
+        Distance of neighboring points, the same along x, y, z [m].
     shape : tuple[int, int, int]
         Numbers of points (nx, ny, nz).
 
@@ -79,7 +79,7 @@ class DistanceGrid:
     origin : ndarray, shape (3,)
         Position of values[0, 0, 0] [m].
     spacing : float
-        Distance of neighbouring grid points, the same along x, y, z [m].
+        Distance of neighboring grid points, the same along x, y, z [m].
     values : ndarray, shape (nx, ny, nz)
         Signed distances [m].
 
@@ -184,7 +184,7 @@ def distance_grid(
     surface : SurfaceMesh
         Organ.
     spacing : float
-        Distance of neighbouring grid points [m].
+        Distance of neighboring grid points [m].
     padding : float
         Distance from the organ to the sides of the grid [m].
     band : float or None

@@ -167,7 +167,7 @@ class Regions:
     clamped : ndarray of bool, shape (n_faces,)
         Clamped faces among ``TetMesh.boundary_faces``.
     accessible : ndarray of bool, shape (n_faces,)
-        Accessible faces, disjoint from the clamp's neighbourhood.
+        Accessible faces, disjoint from the clamp's neighborhood.
     """
 
     clamped: np.ndarray

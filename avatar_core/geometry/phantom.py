@@ -105,7 +105,7 @@ def smooth_union(a: FloatArray, b: FloatArray, width: float) -> FloatArray:
 def relax(
     vertices: FloatArray, faces: IntArray, level_set: LevelSet, sweeps: int = 15
 ) -> FloatArray:
-    """Even out a triangulation of a level set: neighbour averages, put back on the zero surface.
+    """Even out a triangulation of a level set: neighbor averages, put back on the zero surface.
 
     vertices : ndarray, shape (n, 3) [m]
     faces : ndarray, shape (m, 3)

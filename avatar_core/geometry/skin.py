@@ -186,7 +186,7 @@ def _boundary(soup: Soup) -> Soup:
 
 
 def _quartered(vertices: FloatArray, faces: IntArray) -> Soup:
-    """Return every triangle split at the middles of its edges, which are shared by neighbours.
+    """Return every triangle split at the middles of its edges, which are shared by neighbors.
 
     Own code because igl.upsample aborts the process where many faces meet at one edge.
     """

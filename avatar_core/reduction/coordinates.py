@@ -89,7 +89,7 @@ class Coordinate:
                 f"{least:g} <= LOW < HIGH <= {most:g}"
             )
         span = self._scaled(self.high) - self._scaled(self.low)
-        if span == 0.0:  # neighbours whose logarithms round to one number
+        if span == 0.0:  # neighbors whose logarithms round to one number
             raise CoordinateError(
                 f"coordinate {self.name}={self.low!r}:{self.high!r}: the range is empty to "
                 "rounding; give a wider one"

@@ -1,11 +1,11 @@
-"""A Galerkin basis on the patient's own mesh, grown from the neighbours' load functions.
+"""A Galerkin basis on the patient's own mesh, grown from the neighbors' load functions.
 
-The combined response of the neighbours, mapped to the patient, gives load functions w_k(s). On the
+The combined response of the neighbors, mapped to the patient, gives load functions w_k(s). On the
 patient's own mesh each gives one solution, and these span the first space,
 
     K X_k = sum_s w_k(s) f(s),      Y(s) = X^T f(s),      u(x, s) ~ X(x) Y(s)^T,
 
-the Galerkin projection for K-orthonormal X. (Displacement modes of the neighbours would have to be
+the Galerkin projection for K-orthonormal X. (Displacement modes of the neighbors would have to be
 smoothed by K first: 20 sweeps of smoothing cost more than ten direct solutions.) The space grows by
 the solutions for the loads whose residual r = f - K X Y^T is largest in the norm of the diagonal D,
 
@@ -49,7 +49,7 @@ class ReductionRule:
     Attributes
     ----------
     n_start : int
-        Number of load functions taken from the neighbours.
+        Number of load functions taken from the neighbors.
     n_block : int
         Number of load positions solved in one enrichment, three directions each.
     n_probes : int
@@ -273,7 +273,7 @@ def reduce(
     rule: ReductionRule | None = None,
     progress: Callable[[float, GalerkinErrorEstimate], None] = lambda fraction, estimate: None,
 ) -> ReducedResponse:
-    """Return the Galerkin response from the neighbours' load functions, enriched to a tolerance.
+    """Return the Galerkin response from the neighbors' load functions, enriched to a tolerance.
 
     Enrichment stops at the tolerance (mean, and twice that for the worst load), or with
     ``converged`` False after ``max_solution_fraction`` of the fine solutions.
@@ -284,7 +284,7 @@ def reduce(
         Problem on the patient's own mesh.
     loads : sparse, shape (3 n_nodes, n_loads)
     load_functions : ndarray, shape (n_loads, n)
-        Load functions of the neighbours, most important first.
+        Load functions of the neighbors, most important first.
     tolerance : float
         Mean relative L2 error of displacement.
     progress : Callable[[float, GalerkinErrorEstimate], None]
@@ -410,7 +410,7 @@ def residual_compliance(
 def residual_compliance_blocks(
     compliance: FloatArray, support: float, surface: LoadSurface, reach: float
 ) -> LocalBlocks:
-    """Return the residual compliance between neighbouring patches, positive definite.
+    """Return the residual compliance between neighboring patches, positive definite.
 
         dC(s, s') = phi(|s - s'| / support) M(s)^(1/2) M(s')^(1/2)
 

@@ -379,7 +379,7 @@ def _problems(found: Fit, rule: RegistrationRule, strain: float) -> tuple[str, .
         )
     if mismatch > (_MOST_NOISE if rule.correlation else _MOST_MISMATCH) * rule.noise:
         problems.append(
-            f"neighbouring points lie off the surface together, by {1e3 * mismatch:.1f} mm"
+            f"neighboring points lie off the surface together, by {1e3 * mismatch:.1f} mm"
         )
     if strain > _MOST_STRAIN:
         problems.append(

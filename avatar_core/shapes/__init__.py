@@ -8,7 +8,7 @@
     blend = weights.combine(vectors)                      # Eq. 18
 
 Surfaces and level sets come in. A template registered to each of them, the correspondence that
-follows, and weights of neighbours go out.
+follows, and weights of neighbors go out.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ from avatar_core.shapes.weights import (
 BLOCK = 8192  # values of each vector per block of the Gram matrix: the blocks stay in cache
 ROUNDING = 4 * float(np.finfo(float).eps)  # rounding of an inner product, relative to the lengths
 TRUSTED = 5e-11  # if rounding may change weights by more, they are solved from differences
-CLEAR_GAP = 3.0  # ratio of neighbouring eigenvalues from which a spectral gap is clear
+CLEAR_GAP = 3.0  # ratio of neighboring eigenvalues from which a spectral gap is clear
 LOCAL_VARIANCE = 0.99  # part of the variance that the counted principal components explain
 
 
@@ -95,7 +95,7 @@ class Dimension:
     gap : float
         Ratio of the two eigenvalues at the gap; near 1 the spectrum shows no dimension.
     from_local_pca : int
-        Median number of principal components for 99 % of a neighbourhood's variance.
+        Median number of principal components for 99 % of a neighborhood's variance.
     eigenvalues : ndarray
         Lowest eigenvalues of M, ascending.
     local_variances : ndarray, shape (k - 1,)
@@ -120,7 +120,7 @@ class Dimension:
         if self.gap < CLEAR_GAP:
             lines.append(
                 f"no clear gap in the spectrum: the largest ratio is {self.gap:.2g}, after "
-                f"{self.from_gap}; add anatomies, or choose another number of neighbours"
+                f"{self.from_gap}; add anatomies, or choose another number of neighbors"
             )
         if not self.agree:
             lines.append(
@@ -133,7 +133,7 @@ class Dimension:
 class LLE:
     """Locally linear embedding of shapes, in the manner of scikit-learn.
 
-    Each shape X_i is written in terms of its nearest neighbours (Eq. 15), and the coordinates Y_i
+    Each shape X_i is written in terms of its nearest neighbors (Eq. 15), and the coordinates Y_i
     are those that the same weights reconstruct best (Eq. 16):
 
         min sum_i |X_i - sum_j W_ij X_j|^2,  sum_j W_ij = 1;      min |Y - W Y|^2,  Y^T Y = n I
@@ -141,7 +141,7 @@ class LLE:
     Parameters
     ----------
     n_neighbors : int
-        Neighbours of each shape, k.
+        Neighbors of each shape, k.
     n_components : int
         Coordinates of each shape, d.
     regularization : float
@@ -156,9 +156,9 @@ class LLE:
     eigenvalues_ : ndarray, shape (d,)
         Lowest eigenvalues of M = (I - W)^T (I - W), ascending, without that of the constant.
     weights_ : ndarray, shape (n, k)
-        Weights of the neighbours. A repeated shape has weight 1 on the first one equal to it.
+        Weights of the neighbors. A repeated shape has weight 1 on the first one equal to it.
     neighbors_ : ndarray of int, shape (n, k)
-        Neighbours, nearest first, never the shape itself or its equals.
+        Neighbors, nearest first, never the shape itself or its equals.
     same_as_ : ndarray of int, shape (n,)
         Number of the first shape equal to each, mostly its own.
     vectors_ : tuple of n ndarrays, shape (D,)
@@ -218,7 +218,7 @@ class LLE:
     def fit(
         self, X: Sequence[ArrayLike] | FloatArray, y: object = None, *, gram: Gram | None = None
     ) -> LLE:
-        """Find the weights of every shape in terms of its neighbours (Eq. 15).
+        """Find the weights of every shape in terms of its neighbors (Eq. 15).
 
         Parameters
         ----------
@@ -237,7 +237,7 @@ class LLE:
         if not rows:
             raise LLEError("lle: the base is empty; add at least one anatomy")
         if self.n_neighbors <= 0:
-            raise LLEError(f"lle: {self.n_neighbors} neighbours asked for; choose at least 1")
+            raise LLEError(f"lle: {self.n_neighbors} neighbors asked for; choose at least 1")
         require_regularization(self.regularization)
         self.gram_ = _checked_gram(rows, gram)
         self.vectors_, self.same_as_ = rows, _equals(self.gram_)
@@ -321,20 +321,20 @@ class LLE:
     def dimension(self, n_values: int = 20) -> Dimension:
         """Dimension from the gap in the spectrum of M (Polito & Perona 2001) and from local PCA.
 
-        Neither can exceed the number of neighbours minus one. ``notices`` say if they should not
+        Neither can exceed the number of neighbors minus one. ``notices`` say if they should not
         be trusted.
 
         Raises
         ------
         LLEError
-            If there are fewer than 2 neighbours or 4 different anatomies.
+            If there are fewer than 2 neighbors or 4 different anatomies.
         """
         self._require_fitted()
         k = self.neighbors_.shape[1]
         n_different = len(self.vectors_) - len(self.repeated)
         if k < 2 or n_different < 4:
             raise LLEError(
-                f"lle: no dimension from {n_different} different anatomies and {k} neighbour(s); "
+                f"lle: no dimension from {n_different} different anatomies and {k} neighbor(s); "
                 "give at least 4 and 2"
             )
         values, _ = self.spectrum(min(n_values, n_different - 1))
@@ -377,7 +377,7 @@ class LLE:
 
     @property
     def repeated(self) -> tuple[int, ...]:
-        """Members equal to an earlier one; they are not used as neighbours."""
+        """Members equal to an earlier one; they are not used as neighbors."""
         return tuple(int(i) for i in np.flatnonzero(self.same_as_ != np.arange(len(self.same_as_))))
 
     @property
@@ -432,7 +432,7 @@ def _first_equal(gram: Gram, i: int, same_as: IntArray) -> int:
 
 
 def _weights(base: LLE) -> tuple[IntArray, FloatArray]:
-    """Return neighbours and weights of every member, both of shape (n, k)."""
+    """Return neighbors and weights of every member, both of shape (n, k)."""
     n = len(base.vectors_)
     is_first = base.same_as_ == np.arange(n)
     first, again = np.flatnonzero(is_first), np.flatnonzero(~is_first)
@@ -469,7 +469,7 @@ def _row_weights(base: LLE, rows: IntArray, neighbors: IntArray) -> FloatArray:
 
 
 def _imprecise(local: FloatArray, lengths: FloatArray, base: LLE) -> IntArray:
-    """Return neighbourhoods whose weights rounding may change by more than TRUSTED.
+    """Return neighborhoods whose weights rounding may change by more than TRUSTED.
 
     The estimate is the rounding eps |X|^2 of the Gram matrix over the smallest eigenvalue, which is
     at least r tr(C).
@@ -482,7 +482,7 @@ def _imprecise(local: FloatArray, lengths: FloatArray, base: LLE) -> IntArray:
 
 
 def local_variances(base: LLE) -> FloatArray:
-    """Return fractions of the variance along the principal axes of each neighbourhood, descending.
+    """Return fractions of the variance along the principal axes of each neighborhood, descending.
 
     Returns ndarray, shape (members that differ, k - 1).
     """

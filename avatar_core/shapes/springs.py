@@ -95,7 +95,7 @@ def _facing(
     """Return the outward normals of samples, and which samples separate inside from outside.
 
     At a face, the winding number jumps according to the orientation of that face; half an edge
-    away, its neighbours outweigh a flipped face.
+    away, its neighbors outweigh a flipped face.
     """
 
     def inside(offset: float) -> NDArray[np.bool_]:

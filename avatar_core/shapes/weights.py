@@ -1,4 +1,4 @@
-"""Barycentric weights: a shape as a weighted sum of its neighbours.
+"""Barycentric weights: a shape as a weighted sum of its neighbors.
 
 Shapes are vectors, here the signed distances at the points of one grid. Weights follow Eq. 15 of
 Gonzalez, Cueto & Chinesta (2015), after Roweis & Saul (2000), Science 290:2323.
@@ -31,7 +31,7 @@ class Barycenter:
     Attributes
     ----------
     neighbors : ndarray of int, shape (k,)
-        Neighbours, the nearest first.
+        Neighbors, the nearest first.
     weights : ndarray, shape (k,)
         w_j.
     distances : ndarray, shape (k,)
@@ -39,7 +39,7 @@ class Barycenter:
     residual : float
         |x - sum_j w_j X_j|.
     hull_distance : float
-        Distance of x from the convex hull of the neighbours; 0 inside.
+        Distance of x from the convex hull of the neighbors; 0 inside.
     condition : float
         Condition number of the local Gram matrix before regularisation; inf if singular, 1 for a
         member.
@@ -67,7 +67,7 @@ class Barycenter:
 
     @property
     def absolute_sum(self) -> float:
-        """Sum of |w|, which bounds the amplification of errors of the neighbours; 1 if convex."""
+        """Sum of |w|, which bounds the amplification of errors of the neighbors; 1 if convex."""
         return float(np.abs(self.weights).sum())
 
     def combine(self, values: Sequence[ArrayLike] | FloatArray) -> FloatArray:
@@ -106,7 +106,7 @@ def barycenter_weights(gram: FloatArray, regularization: float) -> FloatArray:
         Local Gram matrices C.
     regularization : float
         r > 0, the fraction of the trace added to the diagonal. It divides weight evenly among equal
-        neighbours, and keeps the condition number below 1 / r.
+        neighbors, and keeps the condition number below 1 / r.
     """
     require_regularization(regularization)
     k = gram.shape[-1]
@@ -132,7 +132,7 @@ def convex_weights(gram: FloatArray) -> FloatArray:
     try:
         weights, _ = nnls(np.vstack([root, np.ones(len(gram))]), right)
     except RuntimeError as error:  # its iterations are limited
-        raise LLEError(f"lle: no convex weights ({error}); use fewer neighbours") from error
+        raise LLEError(f"lle: no convex weights ({error}); use fewer neighbors") from error
     return weights / weights.sum()
 
 
@@ -295,9 +295,9 @@ def require_regularization(regularization: float) -> None:
 
 
 def _truncated(n_neighbors: int, available: int) -> tuple[int, tuple[str, ...]]:
-    """Return the number of neighbours to use, and a notice if it is less than requested."""
+    """Return the number of neighbors to use, and a notice if it is less than requested."""
     if n_neighbors <= 0:
-        raise LLEError(f"lle: {n_neighbors} neighbours asked for; choose at least 1")
+        raise LLEError(f"lle: {n_neighbors} neighbors asked for; choose at least 1")
     if available == 0:
         raise LLEError("lle: no anatomy is left in the base; leave out fewer or add some")
     if n_neighbors <= available:
@@ -306,5 +306,5 @@ def _truncated(n_neighbors: int, available: int) -> tuple[int, tuple[str, ...]]:
 
 
 def truncation(asked: int, available: int) -> str:
-    """Return the notice that fewer neighbours are used than were asked for."""
-    return f"{asked} neighbours asked for, {available} used: the base has no more"
+    """Return the notice that fewer neighbors are used than were asked for."""
+    return f"{asked} neighbors asked for, {available} used: the base has no more"

@@ -271,7 +271,7 @@ def _offline(rows: list[Row], axes: Axes) -> None:
             axes.annotate(
                 str(row["setting"]),
                 (seconds[k], errors[k]),
-                xytext=(-4 if k % 2 else 4, 4),  # neighbours beside each other stay readable
+                xytext=(-4 if k % 2 else 4, 4),  # neighbors beside each other stay readable
                 ha="right" if k % 2 else "left",
                 textcoords="offset points",
                 fontsize=7,

@@ -2,7 +2,7 @@
 
 The anatomies are the template bent by smooth maps, with responses of a small rank and on a coarse
 grid. A thousand of them are therefore written in minutes; each goes through the same files as a
-real one. A patient is found by kriging among all, and combined from its neighbours
+real one. A patient is found by kriging among all, and combined from its neighbors
 (``interpolated``, without registration, which does not depend on the atlas). Every row is measured
 in a process of its own.
 """
@@ -116,7 +116,7 @@ class AtlasSizeStudy(Study[AtlasSizeSettings]):
         n = column(run.rows, "n")
         for key, text in (
             ("open_seconds", "open the atlas"),
-            ("find_seconds", "find the neighbours"),
+            ("find_seconds", "find the neighbors"),
             ("combine_seconds", "read and combine their responses"),
             ("add_seconds", "add a surface, roughly registered"),
         ):

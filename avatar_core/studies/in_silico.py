@@ -117,7 +117,7 @@ class InSilicoStudy(Study[InSilicoSettings]):
         return (
             f"{settings.n_base} + {settings.n_held_out} livers by Eq. 17: volume {volume:.2%} "
             f"wrong (paper < 5 %), displacement {twelve:.2%} nodewise ({every:.2%} with all "
-            f"neighbours) and {grid:.2%} on the grid (paper 9.03 %); six eigenvalues {verdict} for "
+            f"neighbors) and {grid:.2%} on the grid (paper 9.03 %); six eigenvalues {verdict} for "
             f"k = 12, {other} for k = 10."
         )
 

@@ -4,7 +4,7 @@ Every method yields weights that sum to one, and all are judged alike. The blend
 are re-initialised near the surface, and the Dice overlap with the true liver is measured. Livers
 are compared with centred volumes, and aligned to the phantom by a similarity transform. Lengths are
 always those of the patient. Scans of one person are left out together. Each method may choose its
-best setting: LLE among numbers of neighbours up to all, PCA among numbers of components up to all.
+best setting: LLE among numbers of neighbors up to all, PCA among numbers of components up to all.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ class LeaveOneOutSettings:
     """Sizes of the study, and the settings that each method may choose from.
 
     n_livers : largest number of livers; None for all
-    neighbors, regularizations : settings of LLE; 0 neighbours are all
-    least_regularizations : further regularizations, with all neighbours only
+    neighbors, regularizations : settings of LLE; 0 neighbors are all
+    least_regularizations : further regularizations, with all neighbors only
     components : settings of PCA; 0 are as many as there are
     shape : shape of the grid
     phantoms : number that replaces a missing folder
@@ -100,7 +100,7 @@ class Base:
 class Method:
     """A way to write liver i by some others: weights(i, others) has the shape of others.
 
-    k : number of neighbours, or of principal components
+    k : number of neighbors, or of principal components
     """
 
     name: str
@@ -131,7 +131,7 @@ class LeaveOneOutStudy(Study[LeaveOneOutSettings]):
             for method in follow(methods(base, settings), f"leave one out, {alignment}"):
                 run.add({"alignment": alignment, **judged(base, method)})
         run.notices.append(
-            "LLE with all neighbours and little regularisation is the projection on all principal "
+            "LLE with all neighbors and little regularisation is the projection on all principal "
             "components: the same affine hull"
         )
 
@@ -150,7 +150,7 @@ class LeaveOneOutStudy(Study[LeaveOneOutSettings]):
         }
         for alignment in ALIGNMENTS:
             summary[f"dice_best_{alignment}"] = _best_dice(where(lle, alignment=alignment))
-        for method in ("convex LLE", "nearest neighbour", "inverse distance", "PCA"):
+        for method in ("convex LLE", "nearest neighbor", "inverse distance", "PCA"):
             found = where(run.rows, method=method)
             summary[f"dice_{method.replace(' ', '_').lower()}"] = _best_dice(found)
         return {**summary, **run.kept}
@@ -161,7 +161,7 @@ class LeaveOneOutStudy(Study[LeaveOneOutSettings]):
             f"{summary['livers']} livers of {summary['subjects']} persons, each written by the "
             f"others: Dice {summary['dice_best']:.3f} at best (k = {best['k']}, regularisation "
             f"{best['regularization']:g}, {best['alignment']}), {summary['dice_k10']:.3f} with "
-            f"k = 10; nearest neighbour {summary['dice_nearest_neighbour']:.3f}, inverse distance "
+            f"k = 10; nearest neighbor {summary['dice_nearest_neighbor']:.3f}, inverse distance "
             f"{summary['dice_inverse_distance']:.3f}, PCA {summary['dice_pca']:.3f}."
         )
 
@@ -175,10 +175,10 @@ class LeaveOneOutStudy(Study[LeaveOneOutSettings]):
                 some = where(rows, method="LLE", regularization=r)
                 _draw_dice(left, some, f"{style}o", f"C{color}", text)
             _draw_dice(left, where(rows, method="PCA"), f"{style}x", "gray", f"PCA, {alignment}")
-        x = "neighbours k, or principal components"
+        x = "neighbors k, or principal components"
         title = "livers left out, scans of one person together"
         label(left, x, "mean Dice [-]", title, legend=7)
-        names = ("nearest neighbour", "inverse distance", "convex LLE", "PCA", "LLE")
+        names = ("nearest neighbor", "inverse distance", "convex LLE", "PCA", "LLE")
         for k, alignment in enumerate(ALIGNMENTS):
             rows = where(run.rows, alignment=alignment)
             best = [_best_dice(where(rows, method=name)) for name in names]
@@ -230,7 +230,7 @@ def methods(base: Base, settings: LeaveOneOutSettings) -> list[Method]:
     choices += [(n - 1, r) for r in settings.least_regularizations]
     found = [Method("LLE", k, r, partial(lle_weights, base.gram, k, r)) for k, r in choices]
     found.append(Method("convex LLE", n - 1, None, partial(hull_weights, base.gram)))
-    found.append(Method("nearest neighbour", 1, None, partial(inverse_weights, base.gram, 1)))
+    found.append(Method("nearest neighbor", 1, None, partial(inverse_weights, base.gram, 1)))
     found.append(
         Method("inverse distance", K_PAPER, None, partial(inverse_weights, base.gram, K_PAPER))
     )

@@ -94,7 +94,7 @@ def rival_rows(
     """Return the rivals with all vertices shown, on fresh loads, by processor time.
 
     The table's time is the curve's time with all modes, times the ratio of both in turns. The curve
-    was timed minutes before, on a machine with neighbours.
+    was timed minutes before, on a machine with neighbors.
     """
     surface, mass = vademecum.surface, vademecum.mesh.lumped_mass
     contacts = draw_contacts(vademecum, n_loads, seed)

@@ -116,7 +116,7 @@ class SamplesStudy(Study[SamplesSettings]):
         left, right = figure.subplots(1, 2, width_ratios=(2, 1))
         rows, n = where(run.rows, kind="error"), run.settings.sizes[-1]
         for key, text, style in (
-            ("nearest", "nearest neighbour", "s:"),
+            ("nearest", "nearest neighbor", "s:"),
             ("error", f"LLE, k = {NEIGHBORS}, mean of all targets", "o-"),
             ("error_worst", "the same, worst target", "^--"),
             ("error_first", "the same, one liver (as in the paper)", "x-"),

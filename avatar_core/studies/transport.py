@@ -67,7 +67,7 @@ SETTINGS: tuple[tuple[Weighting, tuple[int, ...], tuple[float, ...]], ...] = (
     ("lle-template", (20, 40, 0), (3e-4, 1e-3, 1e-2)),
     ("lle-grid", (20, 40, 0), (3e-4, 1e-3, 1e-2)),
     ("lle-paper", (10,), (DEFAULT_REGULARIZATION,)),
-)  # numbers of neighbours (0: all) and ridges that each weighting may choose among
+)  # numbers of neighbors (0: all) and ridges that each weighting may choose among
 WEIGHTINGS: tuple[Weighting, ...] = ("lle-paper", "lle-grid", "lle-template", "kriging")
 
 
@@ -191,7 +191,7 @@ def leave_one_out_table(base: PatientBase) -> list[str]:
 
     Relative L2 errors of displacement node by node on the template, for some load positions.
     """
-    lines = ["| weighting | neighbours | ridge | mean | worst |", "|---|---|---|---|---|"]
+    lines = ["| weighting | neighbors | ridge | mean | worst |", "|---|---|---|---|---|"]
     positions = np.random.default_rng(0).permutation(base.loads.n_positions)[:_SAMPLED]
     rows = (3 * positions[:, None] + np.arange(3)).ravel()
     moved = np.stack([(one.space @ one.load[rows].T).astype(np.float32) for one in base.responses])

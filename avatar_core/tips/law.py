@@ -1,7 +1,7 @@
 """The contact law of a tip: how deep it sinks into the tissue right under it.
 
 A vademecum knows the organ's response to a smooth patch of radius R_p, whatever the size of the
-tip. The patch dents its neighbourhood like a half-space. This dent is taken off, and the dent of
+tip. The patch dents its neighborhood like a half-space. This dent is taken off, and the dent of
 the tip is put in its place. With F the normal force and d the depth of the tip,
 
     d = delta(F) + F [gamma - c],      c = 0.75 / (E* R_p),      E* = E / (1 - nu^2),

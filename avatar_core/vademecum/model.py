@@ -4,7 +4,7 @@ u(x, s) is one field, separated by regions of the load surface and by blocks of 
 consists of global modes, common to all loads, and modes of the region that s lies in
 (:mod:`avatar_core.reduction.block_field`). The contact compliance C(s, s') is the patch-averaged
 displacement at s per patch force at s'. It is the Galerkin compliance Y Y^T of the global modes and
-further ones, plus the exact remainder tapered to the neighbourhood. It is symmetric positive
+further ones, plus the exact remainder tapered to the neighborhood. It is symmetric positive
 definite by construction, and exact at the load positions themselves.
 """
 

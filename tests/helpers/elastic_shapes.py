@@ -61,7 +61,7 @@ def shell_octant(n: int, radii: np.ndarray) -> TetMesh:
     base += [
         [number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]] for i, j in up if i + j < n - 1
     ]
-    low = np.sort(np.array(base), axis=1)  # so that neighbours cut the side of a prism alike
+    low = np.sort(np.array(base), axis=1)  # so that neighbors cut the side of a prism alike
     high = low + len(lattice)
     columns = [low, high]
     prism = [

@@ -129,7 +129,7 @@ def bodies_and_handles(surface: SurfaceMesh) -> tuple[int, int]:
 
 
 def steepest(grid: DistanceGrid) -> float:
-    """Return the largest difference between neighbours per spacing: at most 1 for a distance."""
+    """Return the largest difference between neighbors per spacing: at most 1 for a distance."""
     return max(float(np.abs(np.diff(grid.values, axis=k)).max()) for k in range(3)) / grid.spacing
 
 

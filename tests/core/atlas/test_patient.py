@@ -163,7 +163,7 @@ def test_residuals_are_those_of_the_vectors_themselves(case: Case) -> None:
     assert (held >= 0.0).all() and held.max() < 1e-9 * size
 
 
-def test_error_falls_with_neighbours_functions_and_with_enrichment(case: Case) -> None:
+def test_error_falls_with_neighbors_functions_and_with_enrichment(case: Case) -> None:
     functions = np.linalg.qr(np.random.default_rng(0).standard_normal((case.loads.shape[1], 60)))[0]
     means = []
     basis = GalerkinBasis(case.problem.elasticity, case.loads)
@@ -323,7 +323,7 @@ def test_weights_on_a_grid_need_one(case: Case, weighting: Weighting) -> None:
         patient_weights(case.base, case.problem.registration, case.problem.surface, weighting)
 
 
-def test_a_ridge_spreads_the_weights_of_all_neighbours(case: Case) -> None:
+def test_a_ridge_spreads_the_weights_of_all_neighbors(case: Case) -> None:
     """Weights far above one would distinguish members that the base cannot tell apart."""
     around = (case.base, case.problem.registration, case.problem.surface)
     spread = patient_weights(*around, "lle-template")

@@ -71,7 +71,7 @@ def test_a_member_gets_its_own_vademecum_bit_for_bit(
     again = patient_vademecum(
         read_surface(files[2]), base_of(load_atlas(file)), "interpolated", uncertified
     )
-    assert member.neighbours[0] == "liver2" and member.weights[0] == 1.0
+    assert member.neighbors[0] == "liver2" and member.weights[0] == 1.0
     assert member.weights[1:].any() == np.False_
     own, response = member.vademecum, atlas.read_response(atlas["liver2"])
     assert np.array_equal(own.mesh.vertices, atlas["liver2"].registered)
@@ -96,7 +96,7 @@ def test_copies_count_once(frame: Frame, files: list[Path], tmp_path: Path) -> N
     base = base_of(written(tmp_path / "atlas", frame, [*members, copy]))
     assert base.copies == (N,)
     patient = patient_vademecum(read_surface(files[N]), base, "interpolated", QUICK)
-    assert "liver9" not in patient.neighbours
+    assert "liver9" not in patient.neighbors
     assert patient.weights.sum() == pytest.approx(1.0, abs=1e-9)
 
 
@@ -105,7 +105,7 @@ def test_an_atlas_of_one_answers(frame: Frame, files: list[Path], tmp_path: Path
     alone = written(tmp_path / "atlas", frame, _with_responses()[:1])
     options = replace(QUICK, n_certified=0)
     patient = patient_vademecum(read_surface(files[N]), base_of(alone), "interpolated", options)
-    assert patient.neighbours == ("liver0",) and patient.weights.tolist() == [1.0]
+    assert patient.neighbors == ("liver0",) and patient.weights.tolist() == [1.0]
 
 
 def test_shapes_without_responses_are_refused(atlas: Atlas, folder: Path) -> None:

@@ -23,7 +23,7 @@ from tests.helpers.flat_organ import COMPLIANCE, at_depth, flat_organ
 from tests.helpers.tool_motion import AWAY
 
 often = examples(40, least=16)
-CLOSED = 2e-9  # tolerance of a gap, and of its neighbours' [m]
+CLOSED = 2e-9  # tolerance of a gap, and of its neighbors' [m]
 
 
 def complementarity(data: ContactData) -> float:

@@ -442,7 +442,7 @@ def test_values_near_whole_numbers_are_labels_and_others_are_not(tmp_path):
     from scipy.ndimage import zoom
 
     blurred = zoom(ellipsoid().astype(np.float32), 1.5, order=1)
-    refused(nifti(tmp_path / "blurred.nii", blurred), "are not labels", "nearest neighbour")
+    refused(nifti(tmp_path / "blurred.nii", blurred), "are not labels", "nearest neighbor")
 
 
 def test_units_and_skips_of_nrrd_are_honoured(tmp_path):

@@ -21,7 +21,7 @@ SINGLE = 5e-4  # squared columns in single precision resolve errors above this
 
 @pytest.fixture
 def columns() -> np.ndarray:
-    """Return smooth fields of positions on a line: neighbours are similar, (3 n_v, n, 3)."""
+    """Return smooth fields of positions on a line: neighbors are similar, (3 n_v, n, 3)."""
     x = np.linspace(0.0, 1.0, 3 * N_VERTICES)[:, None, None]
     s = np.linspace(0.0, 1.0, N_POSITIONS)[None, :, None]
     direction = np.array([1.0, 0.3, -0.7])

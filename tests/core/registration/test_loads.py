@@ -187,6 +187,6 @@ def test_two_places_are_found_among_many(phantom_vademecum: Vademecum) -> None:
     error = Noise(np.ones(len(data)), sp.identity(len(data), format="csr"), 1e-4, 1e-6)
     found = find_sites(np.zeros((len(data), 1)), columns, data, error)
     centres = v.surface.centers[places.positions]
-    assert len(found.chosen) <= 3  # two neighbours may replace one
+    assert len(found.chosen) <= 3  # two neighbors may replace one
     for k in true:
         assert np.linalg.norm(centres[found.chosen] - centres[k], axis=1).min() < 0.02

@@ -183,7 +183,7 @@ def test_axes_are_suspected_only_if_a_rigid_motion_fits_them_better(
         assert ("x and y reversed" in said) == is_suspected
 
 
-def test_errors_that_neighbours_share_do_not_average_out(
+def test_errors_that_neighbors_share_do_not_average_out(
     phantom_vademecum: Vademecum, case: Case
 ) -> None:
     """1 mm over 30 mm, as in a stereo camera: 1500 points then determine a shift as 51 patches."""

@@ -1,13 +1,13 @@
 """Weights and growth of a base against mathematics and scikit-learn.
 
 Bases that leave the weights undecided are tested too: equal, nearly equal, in line, few, far away.
-With C the local Gram matrix of k neighbours, r the regularisation and d the least distance, the
-weights minimise w.Cw + r tr(C) |w|^2 among all that sum to one. Compared with the nearest neighbour
+With C the local Gram matrix of k neighbors, r the regularisation and d the least distance, the
+weights minimise w.Cw + r tr(C) |w|^2 among all that sum to one. Compared with the nearest neighbor
 alone, w = e_1, this gives
 
     |w|^2 <= 1 + d^2 / (r tr(C)) <= 1 + 1 / (r k),     w.Cw <= d^2 + r tr(C),
 
-for any neighbours. Compared with an exact representation, x = sum_j v_j X_j, it gives
+for any neighbors. Compared with an exact representation, x = sum_j v_j X_j, it gives
 
     |w| <= |v|,     w.Cw <= r tr(C) |v|^2,     where w.Cw = |x - sum_j w_j X_j|^2.
 """
@@ -97,7 +97,7 @@ def test_a_base_far_from_zero_keeps_its_digits(cloud):
     assert np.abs(LLE(8).fit(far).weight_matrix - theirs).max() < 1e-8
 
 
-def test_condition_of_known_neighbourhoods():
+def test_condition_of_known_neighborhoods():
     right_angled = barycenter(np.eye(4)[:3], np.zeros(4), 3)
     assert right_angled.condition == pytest.approx(1.0)
     in_line = barycenter(np.array([[1.0, 0], [2, 0], [3, 0]]), np.zeros(2), 3)
@@ -276,7 +276,7 @@ def sound(found: Barycenter, base: np.ndarray, x: np.ndarray, r: float) -> None:
 
 
 def rows_are_sound(base: LLE, r: float) -> None:
-    """Check the weights of every member that has neighbours as :func:`sound` does."""
+    """Check the weights of every member that has neighbors as :func:`sound` does."""
     has = len(base.vectors_) - len(base.repeated) > 1
     assert np.isfinite(base.weights_).all()
     sums = base.weight_matrix.sum(axis=1)
@@ -351,7 +351,7 @@ def test_any_base_gives_bounded_weights_that_sum_to_one(
         sound(found, base, x, r)
         convex = barycenter(base, x, k, regularization=r, convex=True)
         assert convex.weights.min() >= 0.0
-        # the nearest point p of the hull: no neighbour lies on x's side of the plane through p
+        # the nearest point p of the hull: no neighbor lies on x's side of the plane through p
         p = convex.weights @ base[convex.neighbors]
         beyond = (base[convex.neighbors] - p) @ (x - p)
         assert beyond.max() <= 1e-6 * max(convex.distances) ** 2
@@ -404,7 +404,7 @@ def test_near_duplicates_of_a_hundredth_of_a_millimetre(livers: np.ndarray) -> N
         assert np.sqrt(np.mean(apart**2)) < rms
 
 
-def test_one_neighbour(livers: np.ndarray) -> None:
+def test_one_neighbor(livers: np.ndarray) -> None:
     base = LLE(1).fit(livers)
     nearest = np.linalg.norm(livers[:, None] - livers, axis=2) + np.diag(np.full(12, np.inf))
     assert np.array_equal(base.neighbors_[:, 0], nearest.argmin(axis=1))
@@ -418,11 +418,11 @@ def test_one_neighbour(livers: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("k", [11, 12, 13, 1000])
-def test_all_neighbours_and_more(livers: np.ndarray, k: int) -> None:
+def test_all_neighbors_and_more(livers: np.ndarray, k: int) -> None:
     """Every other member is used, and the notice says so."""
     base = LLE(k).fit(livers)
     assert base.weights_.shape == (12, 11)
-    notice = f"{k} neighbours asked for, {{}} used: the base has no more"
+    notice = f"{k} neighbors asked for, {{}} used: the base has no more"
     assert base.notices == ((notice.format(11),) if k > 11 else ())
     np.testing.assert_array_equal(base.weights_, LLE(11).fit(livers).weights_)
     rng = np.random.default_rng(k)
@@ -433,7 +433,7 @@ def test_all_neighbours_and_more(livers: np.ndarray, k: int) -> None:
 
 
 def test_a_gram_matrix_without_trace() -> None:
-    """All neighbours equal the point, up to floating-point range: equal weights."""
+    """All neighbors equal the point, up to floating-point range: equal weights."""
     for scale in (0.0, 5e-324, 1e-310, 1e-200):
         gram = scale * np.ones((4, 4))
         for r in (1e-12, 1e-6, 1.0):
@@ -455,7 +455,7 @@ def test_a_gram_matrix_without_trace() -> None:
     ("kind", "shift"), [(np.float64, 0.0), (np.float64, 64.0), (np.float32, 0.0)]
 )
 def test_a_query_equal_to_a_member(livers: np.ndarray, kind: type, shift: float) -> None:
-    """Each member is recognised, and no neighbour is mistaken for it, whatever the origin."""
+    """Each member is recognised, and no neighbor is mistaken for it, whatever the origin."""
     base = LLE(8).fit(livers + shift)
     for i in range(len(livers)):
         found = base.barycenter((livers[i] + shift).astype(kind))

@@ -164,7 +164,7 @@ def test_in_silico(conduct: Conduct) -> None:
     assert run.summary["volume_error"] < 0.02
     # the grid adds its own error to that of the weights
     assert 0 < run.summary["displacement_nodewise"] < run.summary["displacement_grid"] < 0.5
-    assert run.summary["from_gap_k12"] == 6  # 12 neighbours span the six parameters of Eq. 17
+    assert run.summary["from_gap_k12"] == 6  # 12 neighbors span the six parameters of Eq. 17
     assert len(run.notices) == len(in_silico.SPECTRA)
     assert all("stand out" in notice for notice in run.notices)
 
@@ -239,7 +239,7 @@ def test_leave_one_out(conduct: Conduct) -> None:
     run = conduct(leave_one_out.STUDY, settings)
     assert "stand in" in run.notices[0]
     summary = run.summary
-    assert summary["dice_nearest_neighbour"] < summary["dice_k10"] <= summary["dice_best"] < 1
+    assert summary["dice_nearest_neighbor"] < summary["dice_k10"] <= summary["dice_best"] < 1
     assert summary["dice_convex_lle"] < summary["dice_best"]
     rows = {(r["alignment"], r["method"], r["k"], r["regularization"]): r for r in run.rows}
     assert math.isclose(rows["similarity", "convex LLE", 15, None]["absolute_sum"], 1.0)
@@ -307,7 +307,7 @@ def test_principal_weights_project_orthogonally() -> None:
     )
 
 
-def test_all_principal_components_span_what_all_neighbours_do() -> None:
+def test_all_principal_components_span_what_all_neighbors_do() -> None:
     vectors = np.random.default_rng(4).standard_normal((12, 50))
     vectors[11] = vectors[10]  # adds no variance
     gram, others = Gram.of(list(vectors)), np.arange(1, 12)

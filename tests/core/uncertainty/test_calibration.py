@@ -345,7 +345,7 @@ def places() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def bump(places: np.ndarray) -> np.ndarray:
-    """Return deviations to one side for the middle touch and its four neighbours."""
+    """Return deviations to one side for the middle touch and its four neighbors."""
     over = np.linalg.norm(places - places[12], axis=1) < 25e-3
     return np.where(over, 1.8, -0.45)
 

@@ -126,7 +126,7 @@ def test_the_service_writes_what_loader_and_contact_take(
     assert computed_by(worker) - before < INTERPOLATED
     assert (answer.success, answer.file) == (True, "first.h5"), answer.message
     assert took(answer.message, "written") == pytest.approx(answer.seconds, abs=0.01)
-    assert set(answer.neighbours) == {"liver1", "liver2"}
+    assert set(answer.neighbors) == {"liver1", "liver2"}
     assert sum(answer.weights) == pytest.approx(1.0, abs=1e-9)
     assert answer.weight_abs_sum == pytest.approx(np.abs(answer.weights).sum())
     assert answer.hull_distance > 0.0
@@ -158,7 +158,7 @@ def test_a_member_is_recognised_and_keeps_its_volume(node: Module, probe: Any) -
     answer = _ask(probe, surface="liver1.obj", unit="mm", axes="RAS")
     assert answer.success, answer.message
     assert answer.file == "liver1-interpolated.h5"
-    assert (answer.neighbours[0], answer.weights[0]) == ("liver1", 1.0)
+    assert (answer.neighbors[0], answer.weights[0]) == ("liver1", 1.0)
     assert answer.volume_error == 0.0
     assert any("the patient is liver1" in notice for notice in answer.notices)
 
@@ -173,7 +173,7 @@ def test_a_mesh_in_the_request_is_built_by_the_action(
     assert (status, result.success) == (GoalStatus.STATUS_SUCCEEDED, True), result.message
     assert took(result.message, "written") == pytest.approx(result.seconds, abs=0.01)
     assert result.file == "mesh-reduced.h5"
-    assert len(result.neighbours) == 2
+    assert len(result.neighbors) == 2
     assert load_vademecum(folder / result.file).id == result.vademecum_id
     stages = [told.stage.split(":")[0] for told in pursuit.told]
     stages = list(dict.fromkeys(stages))

@@ -65,7 +65,7 @@ def figures(probe: Probe, meanwhile: Callable[[], None]) -> np.ndarray:
 def test_the_loop_keeps_its_figures_while_the_page_is_dragged(
     page: Any, shown: Organ, nodes: dict[str, Module], lasting_probe: Probe
 ) -> None:
-    """Measured in turns, since a machine's neighbours come and go; the tool presses all the time.
+    """Measured in turns, since a machine's neighbors come and go; the tool presses all the time.
 
     A planner's browser draws on another machine. Its load on this one does not count as that of
     the page's node, so the browser draws in both halves.

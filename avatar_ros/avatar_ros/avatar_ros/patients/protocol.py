@@ -72,7 +72,7 @@ class PatientRequest:
     interpolated_first : bool
         Write an interpolated vademecum to the file, before a better one.
     neighbors : int
-        Number of neighbours; 0 for all.
+        Number of neighbors; 0 for all.
     tolerance : float
         Tolerance; 0 for the default.
     output : str
@@ -153,7 +153,7 @@ class Built:
 
     vademecum_id: str
     file: str
-    neighbours: list[str]
+    neighbors: list[str]
     weights: list[float]
     weight_abs_sum: float
     hull_distance: float

@@ -30,7 +30,7 @@ PATIENT_INTERPOLATION = (
     Parameter(
         "weighting",
         "kriging",
-        "weights of the neighbours: kriging, lle-template, lle-grid or lle-paper",
+        "weights of the neighbors: kriging, lle-template, lle-grid or lle-paper",
     ),
     Parameter(
         "certify",

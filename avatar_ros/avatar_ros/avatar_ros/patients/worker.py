@@ -166,7 +166,7 @@ def require_replaceable(path: Path, reader: Reader) -> None:
 def volume_error(patient: Patient, volume: float, volumes: dict[str, float]) -> float:
     """Return |sum w_j V_j / V - 1|: error of the responses' weights when applied to volumes [-]."""
     combined = sum(
-        w * volumes[name] for name, w in zip(patient.neighbours, patient.weights, strict=True)
+        w * volumes[name] for name, w in zip(patient.neighbors, patient.weights, strict=True)
     )
     return abs(float(combined) / volume - 1.0)
 
@@ -206,7 +206,7 @@ def _result_of(
     return Built(
         vademecum_id=identity,
         file=os.path.basename(request.output),
-        neighbours=list(patient.neighbours),
+        neighbors=list(patient.neighbors),
         weights=weights.tolist(),
         weight_abs_sum=patient.barycenter.absolute_sum,
         hull_distance=float(patient.barycenter.hull_distance),
