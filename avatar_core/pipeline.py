@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
 from importlib.metadata import PackageNotFoundError, version
@@ -197,11 +198,20 @@ class OrganOptions:
 
 @repeatable
 def build(
-    surface: SurfaceMesh, options: OrganOptions | None = None, progress: Progress = silent
+    surface: SurfaceMesh,
+    options: OrganOptions | None = None,
+    progress: Progress = silent,
+    responded: Callable[[Vademecum], None] | None = None,
 ) -> Vademecum:
     """Mesh, solve, separate and certify one organ, and time its steps on this machine.
 
     The same surface and options give the same vademecum, bit for bit, but for what a clock says.
+
+    Parameters
+    ----------
+    responded : callable, optional
+        Called with the vademecum once it has its response, before it is certified: certifying
+        compiles the step, for about a minute on a new machine.
 
     Raises
     ------
@@ -235,9 +245,13 @@ def build(
 
     if options.all_coordinates:
         vademecum = build_parametric_vademecum(*common, options.all_coordinates, tip_field, *last)
-        certificate = certify_range(vademecum, elasticity, options.n_certified, options.seed, count)
     else:
         vademecum = build_vademecum(*common, tip_field, *last)
+    if responded is not None:
+        responded(vademecum)
+    if options.all_coordinates:
+        certificate = certify_range(vademecum, elasticity, options.n_certified, options.seed, count)
+    else:
         certificate = certify(vademecum, elasticity, options.n_certified, options.seed, count)
     if options.tumour is not None:
         field = with_tumour(vademecum.tip_field, options.tumour, loads.patch_radius)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,6 +23,9 @@ from avatar_core.cli.study import study
 from avatar_core.cli.uncertainty import uncertainty
 from avatar_core.cli.vademecum import Vertices, show, show_text, vademecum
 from avatar_core.errors import AvatarError
+
+if TYPE_CHECKING:
+    from avatar_core.vademecum.model import Vademecum
 
 app = typer.Typer(
     help="Computational patient avatars: compute the mechanical response of an organ once, and "
@@ -75,37 +78,49 @@ def demo(
     output: Annotated[
         Path, typer.Option("-o", "--output", help="file of the picture (.png, .pdf, .svg)")
     ] = Path("avatar_demo.png"),
-    seconds: Annotated[float, typer.Option(help="duration of the palpation over ROS 2 [s]")] = 10.0,
+    cell: Annotated[
+        bool,
+        typer.Option(
+            "--cell", help="also run the ROS 2 nodes with a scripted tool; print rate and latency"
+        ),
+    ] = False,
+    seconds: Annotated[float, typer.Option(help="duration of each run of --cell [s]")] = 10.0,
     vertices: Vertices = 1200,
     ui: Annotated[
         bool,
-        typer.Option(
-            "--ui", help="serve the planning page in the browser instead of the scripted palpation"
-        ),
+        typer.Option("--ui", help="serve the planning page in the browser instead of a picture"),
     ] = False,
     host: Host = "127.0.0.1",
     port: Port = 8080,
 ) -> None:
     """Build, press and draw the built-in liver.
 
-    The phantom is pressed at 1 kHz over ROS 2. A picture shows the result.
+    The picture has its response first, within a minute. A first run then compiles the step, and the
+    picture shows the force on a tool beside resolved contact. Only --cell and --ui need ROS 2.
     """
     import tempfile
 
-    from avatar_core.cli.picture import palpation_picture
+    from avatar_core.cli.picture import palpation_picture, response_picture
     from avatar_core.geometry.phantom import phantom_liver
     from avatar_core.pipeline import OrganOptions, build
     from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 
-    require_ros()
+    if cell or ui:
+        require_ros()
     if ui:
         require_ui()
     else:
         require_output(output, [".png", ".pdf", ".svg"], [])
-    print("1. building the vademecum of the built-in liver")
+    print("1. building the vademecum of the built-in liver", flush=True)
     surface = phantom_liver()
+
+    def draw(response: Vademecum) -> None:
+        if not ui:
+            response_picture(response, output)
+            print(f"   {output} shows its response; certifying it", flush=True)
+
     with stage_bar(build_stages()) as progress:
-        built = build(surface, OrganOptions(n_vertices=vertices), progress)
+        built = build(surface, OrganOptions(n_vertices=vertices), progress, draw)
     with tempfile.TemporaryDirectory(prefix="avatar_demo_") as folder:
         file = Path(folder) / "phantom.h5"
         save_vademecum(built, file)
@@ -115,12 +130,15 @@ def demo(
             print("2. running the cell; open the address of its page below (Ctrl-C ends both)")
             run_page(file, host, port)
             return
-        print(f"2. running loader, contact and tool as ROS 2 processes for {seconds:g} s")
-        run_cell(file, seconds)
-    print("3. resolving a contact and drawing the picture")
-    with stage_bar() as progress:
-        palpation_picture(v, surface, output, lambda done: progress("contacts", done, float("nan")))
-    print(f"   {output}")
+        print("2. pressing a sphere into it", flush=True)
+        with stage_bar() as progress:
+            palpation_picture(
+                v, surface, output, lambda done: progress("contacts", done, float("nan"))
+            )
+        print(f"   {output} shows the force beside resolved contact")
+        if cell:
+            print(f"3. running loader, contact and tool as ROS 2 processes, {seconds:g} s each run")
+            run_cell(file, seconds)
 
 
 if __name__ == "__main__":

@@ -16,9 +16,11 @@ from avatar_core.errors import ContactError, ConvergenceError, MeshError
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.geometry.tip import Tip
 from avatar_core.offline.resolved_contact import contacts_at
+from avatar_core.scene.surface_export import displaced
 from avatar_core.vademecum.model import Vademecum
 
 TIP = Tip("sphere", 5e-3)
+PUSH = 2.0  # of the first picture: it deforms the phantom visibly [N]
 RESOLVED = (1e-3, 2e-3, 3e-3, 4e-3, 5e-3)  # depths at which contact is resolved [m]
 
 
@@ -45,6 +47,26 @@ class ForceCurve:
         return float(np.abs(found / self.resolved - 1.0).max())
 
 
+def response_picture(vademecum: Vademecum, path: str | Path) -> None:
+    """Draw the organ under ``PUSH`` in the middle of its accessible surface, without any contact.
+
+    Only the vademecum is evaluated, :meth:`Vademecum.displacement_at`, so nothing is compiled.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    point = vademecum.surface.centers[middle_of_access(vademecum)]
+    points = displaced(vademecum, vademecum.displacement_at(point, PUSH))
+    cloud = np.hstack([points, points - vademecum.surface_vertices])
+    figure = plt.figure(figsize=(6, 4.8), layout="constrained")
+    _draw_organ(figure.add_subplot(), vademecum, cloud, point)
+    figure.suptitle(f"A push of {PUSH:g} N on a patch, from the vademecum alone")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
 def palpation_picture(
     vademecum: Vademecum,
     surface: SurfaceMesh,
@@ -69,7 +91,7 @@ def palpation_picture(
     data = model_of(vademecum, (TIP,)).data()
     curve = force_curve(vademecum, surface, site, data, progress)
     figure = plt.figure(figsize=(12, 4.8), layout="constrained")
-    _draw_organ(figure, vademecum, data.out.cloud, site.point)
+    _draw_organ(figure.add_subplot(1, 2, 1), vademecum, data.out.cloud, site.point)
     _draw_curve(figure, curve)
     figure.savefig(path, dpi=110)
     plt.close(figure)
@@ -105,8 +127,7 @@ def _resolved(
         return None
 
 
-def _draw_organ(figure, vademecum: Vademecum, cloud: np.ndarray, tip: np.ndarray) -> None:  # type: ignore[no-untyped-def]
-    axes = figure.add_subplot(1, 2, 1)
+def _draw_organ(axes, vademecum: Vademecum, cloud: np.ndarray, tip: np.ndarray) -> None:  # type: ignore[no-untyped-def]
     faces = vademecum.organ_faces
     corner = cloud[faces]
     front = np.argsort(corner[:, :, 1].mean(axis=1))  # painter's order, seen from anterior
@@ -132,7 +153,7 @@ def _draw_organ(figure, vademecum: Vademecum, cloud: np.ndarray, tip: np.ndarray
     axes.set_xlabel("patient's right    x [mm]    patient's left")
     axes.set_ylabel("z, superior [mm]")
     axes.set_title(f"{vademecum.name}: deformed organ, tool tip circled")
-    figure.colorbar(scale, ax=axes, label="displacement [mm]", shrink=0.8)
+    axes.figure.colorbar(scale, ax=axes, label="displacement [mm]", shrink=0.8)
 
 
 def _draw_curve(figure, curve: ForceCurve) -> None:  # type: ignore[no-untyped-def]
