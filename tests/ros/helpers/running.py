@@ -10,6 +10,7 @@ from avatar_ros.bench.cell import Module
 
 EXECUTABLES = {
     "contact",
+    "effort_bridge",
     "organ_markers",
     "patient_interpolation",
     "planning_ui",

@@ -1,0 +1,50 @@
+"""Wrenches of a tool arrive as commands of an effort controller, and cease with it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from geometry_msgs.msg import WrenchStamped
+from std_msgs.msg import Float64MultiArray
+
+from avatar_ros.framework import qos
+from tests.ros.helpers.running import running
+
+
+@pytest.mark.parametrize(
+    ("axes", "efforts"), [(3, [1.0, 2.0, 3.0]), (7, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 0.0])]
+)
+def test_a_wrench_arrives_and_ends_with_its_sender(
+    own_domain: dict[str, str], probe: Any, axes: int, efforts: list[float]
+) -> None:
+    message = WrenchStamped()
+    force, torque = message.wrench.force, message.wrench.torque
+    force.x, force.y, force.z = 1.0, 2.0, 3.0
+    torque.x, torque.y, torque.z = 4.0, 5.0, 6.0
+    wrenches = probe.node.create_publisher(WrenchStamped, "tool/servo_cf", qos.COMMAND)
+    heard: list[list[float]] = []
+    probe.node.create_subscription(
+        Float64MultiArray, "commands", lambda one: heard.append(list(one.data)), qos.COMMAND
+    )
+    with running("effort_bridge", own_domain, f"axes:={axes}"):
+        probe.next(
+            Float64MultiArray, "commands", qos.COMMAND, meanwhile=lambda: wrenches.publish(message)
+        )
+        probe.until(lambda: heard[-1:] == [[0.0] * axes], 10.0)  # none comes any more
+        assert efforts in heard and all(one in (efforts, [0.0] * axes) for one in heard)
+
+
+def test_it_sends_zero_when_it_ends(own_domain: dict[str, str], probe: Any) -> None:
+    message = WrenchStamped()
+    message.wrench.force.z = 3.0
+    wrenches = probe.node.create_publisher(WrenchStamped, "tool/servo_cf", qos.COMMAND)
+    heard: list[list[float]] = []
+    probe.node.create_subscription(
+        Float64MultiArray, "commands", lambda one: heard.append(list(one.data)), qos.COMMAND
+    )
+    with running("effort_bridge", own_domain, "timeout:=1.0"):
+        probe.next(
+            Float64MultiArray, "commands", qos.COMMAND, meanwhile=lambda: wrenches.publish(message)
+        )
+    probe.until(lambda: heard[-1:] == [[0.0] * 3], 10.0)
