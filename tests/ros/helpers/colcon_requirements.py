@@ -13,7 +13,17 @@ try:
 except ImportError:  # Python 3.10
     import tomli as tomllib  # type: ignore[no-redef]
 
-COLCON = ("colcon-core", "colcon-cmake", "colcon-ros", "colcon-bash", "colcon-output", "cmake")
+COLCON = (
+    "colcon-core",
+    "colcon-cmake",
+    "colcon-ros",
+    "colcon-bash",
+    "colcon-output",
+    "colcon-package-selection",
+    "colcon-test-result",
+    "cmake",
+    "pytest",
+)
 
 
 def requirements(path: Path) -> list[str]:

@@ -1,14 +1,10 @@
-"""Launch files: evaluated by a stand-in for launch, and run by launch where it is installed."""
+"""Launch files, evaluated by a stand-in for launch; `colcon test` runs them by launch."""
 
 from __future__ import annotations
 
 import inspect
-import os
 import runpy
-import signal
-import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -16,28 +12,12 @@ import pytest
 import yaml
 
 from avatar_core.cli.cell import cell as avatar_cell
-from avatar_interfaces.msg import ContactState
-from avatar_ros.framework import qos
 from avatar_ros.nodes import cell
-from tests.helpers.slowness import end_of
-from tests.ros.conftest import START_TIMEOUT
 from tests.ros.helpers import fake_launch
 from tests.ros.helpers.doc_pages import ROOT
 
 FOLDER = ROOT / "avatar_ros" / "avatar_ros" / "launch"
 PARAMS = ROOT / "params" / "planning_cell.yaml"
-# as `ros2 launch FILE name:=value` does it (ros2launch.api.launch_a_launch_file)
-ROS2_LAUNCH = """
-import sys, launch
-from launch.actions import IncludeLaunchDescription
-from launch.launch_description_sources import AnyLaunchDescriptionSource
-path, *arguments = sys.argv[1:]
-pairs = [word.split(":=", 1) for word in arguments]
-service = launch.LaunchService(argv=arguments, noninteractive=True)
-file = IncludeLaunchDescription(AnyLaunchDescriptionSource(path), launch_arguments=pairs)
-service.include_launch_description(launch.LaunchDescription([file]))
-raise SystemExit(service.run())
-"""
 
 
 @pytest.fixture
@@ -115,54 +95,3 @@ def test_the_file_in_yaml_includes_that_in_python_and_nothing_else() -> None:
     content = yaml.safe_load((FOLDER / "planning_cell.launch.yaml").read_text())
     path = "$(find-pkg-share avatar_ros)/launch/planning_cell.launch.py"
     assert content == {"launch": [{"include": {"file": path}}]}
-
-
-def launched(name: str, arguments: list[str], domain: dict[str, str]) -> subprocess.Popen[str]:
-    """Run an installed launch file by launch."""
-    needed = ("launch", "launch_ros", *(["launch_yaml"] if name.endswith("yaml") else []))
-    missing = [package for package in needed if find_spec(package) is None]
-    if missing:
-        pytest.skip(f"not installed, and no wheel brings it: {', '.join(missing)}")
-    path = Path(sys.prefix, "share/avatar_ros/launch", name)
-    # as the README exports them
-    ours = {"AMENT_PREFIX_PATH": sys.prefix, "PATH": str(Path(sys.prefix, "bin"))}
-    paths = {n: f"{own}:{os.environ.get(n, '')}".rstrip(":") for n, own in ours.items()}
-    return subprocess.Popen(
-        [sys.executable, "-c", ROS2_LAUNCH, str(path), *arguments],
-        cwd="/",
-        env={**domain, **paths},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
-FILES = pytest.mark.parametrize("name", ["planning_cell.launch.py", "planning_cell.launch.yaml"])
-
-
-@FILES
-def test_launch_runs_a_cell_that_a_signal_ends(
-    own_domain: dict[str, str], library: Path, probe: Any, name: str
-) -> None:
-    arguments = [f"library_dir:={library}", "vademecum:=liver.h5", f"params:={PARAMS}"]
-    with launched(name, arguments, own_domain) as process:
-        try:
-            probe.next(
-                ContactState, "contact_state", qos.state(1), lambda s: s.vademecum_id, START_TIMEOUT
-            )
-            process.send_signal(signal.SIGINT)
-            assert end_of(process, 20.0) == 0
-        finally:
-            process.kill()
-        said = process.communicate()[0]
-    assert said.count("process has finished cleanly") == 2
-    assert "patient_interpolation" not in said
-
-
-@FILES
-def test_launch_refuses_a_mistyped_argument(own_domain: dict[str, str], name: str) -> None:
-    with launched(name, ["vademecums:=liver.h5"], own_domain) as process:
-        assert end_of(process, START_TIMEOUT) == 1
-        said = process.communicate()[0]
-    assert "there is no argument vademecums" in said
-    assert "process started" not in said
