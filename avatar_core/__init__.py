@@ -34,6 +34,7 @@ from avatar_core.common.lazy import lazy
 # Imported when first asked for: the command and the nodes start without compiling or meshing.
 _ORIGIN = {
     "Atlas": "atlas.model",
+    "AtlasOptions": "atlas.growth",
     "AvatarError": "errors",
     "Budget": "vademecum.accuracy",
     "BuildRule": "offline.rule",
@@ -53,6 +54,7 @@ _ORIGIN = {
     "PatientOptions": "atlas.patient",
     "Registered": "registration.register",
     "RegistrationRule": "registration.fit",
+    "ResponseSolver": "atlas.response",
     "Scene": "scene.model",
     "Status": "contact.status",
     "SupportOption": "offline.supports",
@@ -60,6 +62,7 @@ _ORIGIN = {
     "Tip": "geometry.tip",
     "Tool": "scene.model",
     "Vademecum": "vademecum.model",
+    "Workers": "atlas.workers",
     "build": "pipeline",
     "calibrate": "uncertainty.calibration",
     "create_atlas": "atlas.growth",
@@ -90,13 +93,16 @@ if TYPE_CHECKING:
     from avatar_core import reduction as mor  # noqa: F401
     from avatar_core import shapes as shapes
     from avatar_core import uncertainty as uncertainty
+    from avatar_core.atlas.growth import AtlasOptions as AtlasOptions
     from avatar_core.atlas.growth import create_atlas as create_atlas
     from avatar_core.atlas.growth import extend_atlas as extend_atlas
     from avatar_core.atlas.model import Atlas as Atlas
     from avatar_core.atlas.patient import Patient as Patient
     from avatar_core.atlas.patient import PatientOptions as PatientOptions
     from avatar_core.atlas.patient import patient_vademecum as patient  # noqa: F401
+    from avatar_core.atlas.response import ResponseSolver as ResponseSolver
     from avatar_core.atlas.storage import load_atlas as load_atlas
+    from avatar_core.atlas.workers import Workers as Workers
     from avatar_core.contact import effects as effects
     from avatar_core.contact.many import step_many as step_many
     from avatar_core.contact.model import ContactData as ContactData

@@ -85,6 +85,11 @@ class AtlasOptions:
         Spacing of the grid in the box [m].
     rule : TemplateRule
         Rule of all registrations.
+
+    Examples
+    --------
+    >>> av.AtlasOptions(template_vertices=700).spacing
+    0.009
     """
 
     template_vertices: int = 2500
@@ -166,7 +171,8 @@ def create_atlas(
     template : Template or None
         None takes the built-in liver with ``options.template_vertices``.
     workers : Workers or None
-        Where anatomies are built.
+        Processes that build the anatomies. None takes this one. A script that asks for more needs
+        ``if __name__ == "__main__":``, as each process imports it again.
     solve_response : callable or None
         Solver of each registration's Response, e.g. ``ResponseSolver()``; picklable. None stores
         shapes alone.
@@ -190,7 +196,7 @@ def create_atlas(
     folder, options = Path(path), options or AtlasOptions()
     with _folder_of(folder):
         frame = _begun(folder, options, template)
-        return _grow(folder, frame, sources, workers or Workers(), solve_response, progress)
+        return _grow(folder, frame, sources, workers or Workers(jobs=1), solve_response, progress)
 
 
 def extend_atlas(
@@ -216,7 +222,7 @@ def extend_atlas(
     folder = Path(path)
     frame, _ = load_frame(folder)
     with _folder_of(folder):
-        return _grow(folder, frame, sources, workers or Workers(), solve_response, progress)
+        return _grow(folder, frame, sources, workers or Workers(jobs=1), solve_response, progress)
 
 
 # --- the folder -------------------------------------------------------------------------------

@@ -22,6 +22,11 @@ class ResponseSolver:
         Material of all anatomies.
     rank : int
         Number of modes that are kept.
+
+    Examples
+    --------
+    >>> av.ResponseSolver(rank=30).material.poisson_ratio
+    0.48
     """
 
     material: Material = field(default_factory=Material)

@@ -40,6 +40,11 @@ class Workers:
     scheduler : str or None
         Address of a Dask scheduler whose workers run the tasks instead; the workers need avatar,
         too.
+
+    Examples
+    --------
+    >>> dict(av.Workers(jobs=1).map(abs, [-1, -2]))
+    {0: 1, 1: 2}
     """
 
     jobs: int | None = None

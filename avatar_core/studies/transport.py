@@ -44,6 +44,7 @@ from avatar_core.atlas.transfer import (
     combine,
     patient_weights,
 )
+from avatar_core.atlas.workers import Workers
 from avatar_core.common.processes import cpu_seconds
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import patch_loads
@@ -248,7 +249,12 @@ def _atlas(surfaces: Sequence[SurfaceMesh], path: Path, settings: TransportSetti
             bar.update(done - bar.n)
 
         return create_atlas(
-            path, list(surfaces), options, solve_response=solve_response, progress=advance
+            path,
+            list(surfaces),
+            options,
+            workers=Workers(),
+            solve_response=solve_response,
+            progress=advance,
         ).atlas
 
 
