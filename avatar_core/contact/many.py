@@ -1,34 +1,30 @@
 """The step of many loops on one organ in one call, for those who train policies.
 
-The loops are shared among threads. Each thread runs a compiled loop that has released Python's
-global lock and calls the machine code of the step itself: the results are those of
+The loops are shared among threads. The step holds Python's global lock, as a 1 kHz loop must; here
+ctypes calls the same machine code, which releases the lock meanwhile. The results are those of
 :func:`avatar_core.contact.model.step`, bit for bit.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import count
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 
 from avatar_core.common.array_table import TableType
-from avatar_core.common.jit import compiled
 from avatar_core.common.processes import n_cores
 from avatar_core.contact import step as kernels
 from avatar_core.contact.data import DATA
 from avatar_core.contact.layout import MODEL
-from avatar_core.contact.model import ContactData, ContactModel, compiled_for, compiled_step
+from avatar_core.contact.model import ContactData, ContactModel, compiled_step
 from avatar_core.errors import ContactError
 
-_TABLES = TableType(MODEL), TableType(DATA)
-_POINTER = ir.IntType(64).as_pointer()
 _WORTH = 32  # loops from which another thread gains more than it takes to start
 
 
@@ -82,14 +78,24 @@ def step_many(
     places = _shaped("tips", tips, (k, n_tools, 3), float)
     turns = _shaped("orientations", orientations, (k, n_tools, 4), float)
     closed = _shaped("jaws", jaws, (k, n_tools), bool)
-    loop, solve, deform = _compiled_loop()
-    tables = np.array([data.table.address for data in datas], np.int64)
-    status, begun = np.zeros(k, np.int64), np.zeros(1, np.int64)
-    given = tables, places, turns, closed, status, begun.ctypes.data
+    solve, deform = _kernels()
+    status, turn = np.zeros(k, np.int64), count()
 
     def advance() -> None:
         """Take loops as long as there are some: a thread that starts late is not waited for."""
-        loop(solve, deform, model.table.address, *given)
+        result, organ = ctypes.c_int64(), model.table.address
+        for i in iter(turn.__next__, -1):
+            if i >= k:
+                return
+            state, table = datas[i].state, datas[i].table.address
+            state.tip[:] = places[i]
+            if datas[i].turns:
+                state.orientation[:] = turns[i] if len(turns) else 0.0
+            if len(closed):
+                state.jaw[:] = closed[i]
+            solve(ctypes.byref(result), None, organ, table)
+            status[i] = result.value
+            deform(ctypes.byref(result), None, organ, table)
 
     others = [_pool(os.getpid()).submit(advance) for _ in range(min(n_cores() - 1, k // _WORTH))]
     advance()
@@ -116,75 +122,13 @@ def _shaped(name: str, given: Any, shape: tuple[int, ...], kind: type) -> np.nda
 
 
 @cache
-def _compiled_loop() -> tuple[Any, int, int]:
-    """The loop over tables, and the addresses of both halves of the step."""
+def _kernels() -> list[Callable[..., int]]:
+    """Both halves of the step as C functions, by the calling convention of numba.
+
+    int32 f(result *, exception **, model *, data *); the step raises none.
+    """
     compiled_step()
-    word, words = types.int64, types.Array(types.int64, 1, "C")
-    numbers, flags = types.Array(types.float64, 3, "C"), types.Array(types.boolean, 2, "C")
-    loop = compiled_for(_loop, word, word, word, words, numbers, numbers, flags, words, word)
-    return loop, *(_address(one) for one in (kernels.contact_solve, kernels.contact_deform))
-
-
-def _address(kernel: Any) -> int:
-    """Where the machine code of a kernel of the step lies."""
-    found = kernel.overloads[_TABLES]
-    return int(found.library.get_pointer_to_function(found.fndesc.llvm_func_name))
-
-
-def _called(result: Any) -> Any:
-    """A kernel of the step, called at its address with the addresses of two tables."""
-
-    def call(typing: Any, kernel: Any, model: Any, data: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            of = context.call_conv.get_function_type(result, _TABLES).as_pointer()
-            function = builder.inttoptr(arguments[0], of)
-            tables = [builder.inttoptr(one, _POINTER) for one in arguments[1:]]
-            convention = context.call_conv
-            _, found = convention.call_function(builder, function, result, _TABLES, tables)
-            return found
-
-        return result(kernel, model, data), generate
-
-    return intrinsic(call)
-
-
-def _state(typing: Any, address: Any) -> Any:
-    """The state of a loop, of the address of its table."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.inttoptr(arguments[0], _POINTER)
-
-    return _TABLES[1](address), generate
-
-
-def _taken(typing: Any, counter: Any) -> Any:
-    """The number at an address, which is one more for whoever asks next."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        where, one = builder.inttoptr(arguments[0], _POINTER), ir.IntType(64)(1)
-        return builder.atomic_rmw("add", where, one, "seq_cst")
-
-    return types.int64(types.int64), generate
-
-
-_solve_at, _deform_at = _called(types.int64), _called(types.none)
-_data_at: Any = intrinsic(_state)
-_next: Any = intrinsic(_taken)
-
-
-@compiled(nogil=True)
-def _loop(solve, deform, model, tables, tips, turns, jaws, status, begun):  # type: ignore[no-untyped-def]
-    i = _next(begun)
-    while i < len(tables):
-        data = _data_at(tables[i])
-        for t in range(tips.shape[1]):
-            for c in range(3):
-                data.tip[t, c] = tips[i, t, c]
-            if data.friction.on or data.tilt.on:
-                for c in range(4):
-                    data.orientation[t, c] = turns[i, t, c] if len(turns) else 0.0
-            if len(jaws):
-                data.jaw[t] = jaws[i, t]
-        status[i] = _solve_at(solve, model, tables[i])
-        _deform_at(deform, model, tables[i])
-        i = _next(begun)
+    tables, pointer = (TableType(MODEL), TableType(DATA)), ctypes.c_void_p
+    kind = ctypes.CFUNCTYPE(ctypes.c_int32, pointer, pointer, pointer, pointer)
+    found = (kernel.overloads[tables] for kernel in (kernels.contact_solve, kernels.contact_deform))
+    return [kind(one.library.get_pointer_to_function(one.fndesc.llvm_func_name)) for one in found]
