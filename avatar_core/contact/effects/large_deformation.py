@@ -20,7 +20,6 @@ from avatar_core.contact.effects.base import Effect, Ground
 from avatar_core.contact.effects.grasp import FARTHEST, is_held, linearly_moved
 from avatar_core.errors import SceneError
 from avatar_core.tips.profile import TAKEN
-from avatar_core.vademecum.large_deformation import PULL, PUSH
 
 if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
@@ -66,6 +65,7 @@ class LargeDeformation(Effect):
         # Here, because the contact node needs none of it.
         """Return coefficients and reach on the tip field's grid, and the loads of the modes."""
         from avatar_core.contact.organ_response import sampled_at_tip
+        from avatar_core.vademecum.large_deformation import PULL, PUSH
 
         large, vademecum = ground.vademecum.large, ground.vademecum
         assert large is not None  # by `require`

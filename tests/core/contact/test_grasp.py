@@ -155,8 +155,13 @@ def test_a_large_pull_beyond_its_reach_is_said(soft_hold: tuple[ContactData, np.
     data, at = soft_hold
     n = data.state.normal[0].copy()
     reach = float(data.state.large_deformation.pulled[0, 2])
-    assert step(data.model, data, at + 0.7 * reach * n) == Status.OK
-    assert step(data.model, data, at + 3.0 * reach * n) == Status.EXTRAPOLATED
+    near = 12e-3 * n
+    assert step(data.model, data, at + near) == Status.OK
+    depth = data.state.self_compliance[0] * float(data.out.force[0] @ n)
+    far = 1.1 * reach / abs(depth) * near
+    assert step(data.model, data, at + far) == Status.EXTRAPOLATED
+    data.state.large_deformation.pulled[0, 2] = 1.0
+    assert step(data.model, data, at + far) == Status.OK  # the jaw's own disc is still in its range
     aside = np.cross(n, np.eye(3)[np.argmin(abs(n))])
     aside *= 1.2 * FARTHEST / np.linalg.norm(aside)
     assert step(data.model, data, at + aside) == Status.EXTRAPOLATED
