@@ -28,7 +28,7 @@ def test_launch_runs_a_cell_that_a_signal_ends(tmp_path: Path, name: str) -> Non
     with launched(name, f"library_dir:={tmp_path}") as process:
         try:
             said = ""
-            while "safety.device" not in said and process.stdout:  # contact is active
+            while "no pose of the tool" not in said and process.stdout:  # contact runs
                 line = process.stdout.readline()
                 assert line, f"launch ended: {said}"
                 said += line

@@ -7,7 +7,8 @@
 #
 # WITHOUT_CRTK=1    a workspace without crtk_msgs, as rosdep leaves it
 # UPSTREAM=FOLDER   checkouts that no wheel brings, built too: ament_lint, launch, launch_ros,
-#                   rcl_interfaces, ros2cli (branch jazzy). Without them colcon test runs neither linters nor launch, and says so
+#                   rcl_interfaces, rosidl_runtime_py, ros2cli (branch jazzy). Without them
+#                   colcon test runs neither linters nor launch, and says so
 #
 # Ends with 77 where PyPI cannot be reached, and says so.
 set -euo pipefail
@@ -72,15 +73,16 @@ else
     "CONFIG_EXTRAS \${CMAKE_CURRENT_BINARY_DIR}/lint.cmake"
 fi
 if [ -d "$upstream/launch" ] && [ -d "$upstream/launch_ros" ] && [ -d "$upstream/ros2cli" ] &&
-  [ -d "$upstream/rcl_interfaces" ]; then
-  for package in rcl_interfaces/composition_interfaces launch/{launch,launch_xml,launch_yaml} \
+  [ -d "$upstream/rcl_interfaces" ] && [ -d "$upstream/rosidl_runtime_py" ]; then
+  for package in rcl_interfaces/composition_interfaces rosidl_runtime_py \
+    launch/{launch,launch_xml,launch_yaml} \
     launch_ros/{launch_ros,ros2launch} \
     ros2cli/{ros2cli,ros2interface,ros2pkg,ros2run}; do
     cp -r "$upstream/$package" "$source/underlay/"
   done
   "$python" -m pip install -q argcomplete psutil osrf-pycommon lxml >>"$folder/pip.log" 2>&1
 else
-  echo "skipped: launch and ros2 (no launch, launch_ros, rcl_interfaces and ros2cli in UPSTREAM)"
+  echo "skipped: launch and ros2 (not all of launch, launch_ros, rcl_interfaces, rosidl_runtime_py, ros2cli)"
 fi
 
 # 3. A workspace with the whole repository in it, as somebody clones it.
