@@ -9,6 +9,8 @@ from geometry_msgs.msg import WrenchStamped
 from std_msgs.msg import Float64MultiArray
 
 from avatar_ros.framework import qos
+from avatar_ros.nodes.effort_bridge import EFFORT_BRIDGE
+from tests.ros.helpers.doc_pages import parameter_rows, yaml_parameters
 from tests.ros.helpers.running import running
 
 
@@ -48,3 +50,9 @@ def test_it_sends_zero_when_it_ends(own_domain: dict[str, str], probe: Any) -> N
             Float64MultiArray, "commands", qos.COMMAND, meanwhile=lambda: wrenches.publish(message)
         )
     probe.until(lambda: heard[-1:] == [[0.0] * 3], 10.0)
+
+
+def test_page_and_file_hold_every_parameter_at_its_default() -> None:
+    defaults = {p.name: p.default for p in EFFORT_BRIDGE}
+    assert set(parameter_rows("effort_bridge")) == set(defaults)
+    assert yaml_parameters("effort_bridge") == defaults

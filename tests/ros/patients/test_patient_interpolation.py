@@ -249,7 +249,7 @@ def test_a_preview_shows_what_the_template_does_not_reach(
 
 def test_services_and_actions_are_those_of_the_pages(node: Module) -> None:
     rows = [row for row in index() if row["node"] == NODE]
-    named = {row["interface"]: row["type"] for row in rows if row["kind"] == "service"}
+    named = {row["interface"]: row["type"] for row in rows if row["kind"] == "srv"}
     documented = {f"/{name}": kind for name, kind in named.items()}
     actions = [(f"/{row['interface']}", [row["type"]]) for row in rows if row["kind"] == "action"]
     assert documented and len(actions) == 1
