@@ -118,7 +118,7 @@ def test_check_says_every_number_of_a_tip(run: Any) -> None:
 def test_check_says_units_outputs_and_what_combines(run: Any) -> None:
     _, out, _ = run("check", "everything")
     for line in (
-        r"density +1060 kg/m\^3 +of the organ",
+        r"density +1060 kg/m\^3 +density of the organ",
         r"tau +0\.5, 8 s +relaxation time",
         r"static +0\.4 +mu_s",
         r"cloud of the surface every 4 steps with all modes",
