@@ -89,6 +89,13 @@ class TetMesh:
         return np.isin(self.pieces, self.pieces[second])
 
     @cached_property
+    def on_second_side(self) -> np.ndarray:
+        """Mask of vertices on the second side of the cut, shape (n_vertices,)."""
+        found = np.zeros(len(self.vertices), bool)
+        found[self.tets[self.is_second_side]] = True
+        return found
+
+    @cached_property
     def cut_faces(self) -> np.ndarray:
         """Triangles of the cut's two sides, vertex by vertex in pairs, shape (2, n, 3)."""
         if self.pairs is None:

@@ -128,8 +128,7 @@ def _split(
     Triangles with corners on both sides are divided at the cut, and the points there are doubled.
     """
     (points, faces), (corners, weights) = organ, tied
-    second = np.zeros(len(mesh.vertices), bool)
-    second[mesh.tets[mesh.is_second_side]] = True
+    second = mesh.on_second_side
     side = second[corners[:, 0]].astype(int)
     crossed = np.ptp(side[faces], axis=1) > 0
     across = faces[crossed]

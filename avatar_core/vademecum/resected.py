@@ -27,13 +27,11 @@ def margins(v: Vademecum, points: np.ndarray | None = None) -> dict[str, float]:
     if v.display is None or not len(v.cut_walls):
         return {}
     points = np.asarray(v.display.vertices if points is None else points, float)
-    second = np.zeros(len(v.mesh.vertices), bool)
-    second[v.mesh.tets[v.mesh.is_second_side]] = True
     out = {}
     for name, faces in v.structures.items():
         used = np.unique(faces)
         nearest, _, _ = closest_points(points, v.cut_walls, points[used])
-        side = second[v.display.corners[used, 0]]
+        side = v.mesh.on_second_side[v.display.corners[used, 0]]
         is_cut = bool(side.any() and not side.all())
         out[name] = 0.0 if is_cut else float(np.linalg.norm(points[used] - nearest, axis=1).min())
     return out

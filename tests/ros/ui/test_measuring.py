@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from avatar_core.geometry.tip import Tip
-from avatar_ros.ui.measure.measures import PLANE, TOOL, Measures
+from avatar_ros.ui.measure.measures import PLANE, TOOL, Measures, Now
 from avatar_ros.ui.measure.measures_view import MeasuresView
 from avatar_ros.ui.session.presets import material_text
 from avatar_ros.ui.view.measuring import Place, depth, gap, hit, is_plane, margin
@@ -83,6 +83,25 @@ def test_three_points_on_a_line_are_no_plane() -> None:
 # --- Places -----------------------------------------------------------------------------------
 
 CORNERS = np.array([[0.05, 0.2, 0.05], [0.15, 0.2, 0.05], [0.1, 0.2, 0.15]])
+
+
+def test_the_way_to_a_cut_is_said_at_rest_and_now(
+    cube: Organ, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The margin at rest is found once, that of now from the points that are drawn."""
+    asked: list[Any] = []
+
+    def margins(vademecum: Any, points: Any = None) -> dict[str, float]:
+        asked.append(points)
+        return {"lesion": 0.010 if points is None else 0.007}
+
+    monkeypatch.setattr("avatar_ros.ui.measure.measures.margins", margins)
+    measures = Measures(Noted())  # type: ignore[arg-type]
+    measures.show_organ(cube, Tip())
+    for _ in range(2):
+        lines = measures.lines(Now(cube.vertices, cube.vertices[0], 1e3))
+    assert "Cut to lesion: 10.0 mm at rest, 7.0 mm now" in lines
+    assert [points is None for points in asked] == [True, False, False]
 
 
 def test_a_dot_of_a_plane_is_dragged_over_the_organ(cube: Organ) -> None:

@@ -254,6 +254,16 @@ def test_a_structure_belongs_to_its_organ_and_moves_with_it(view: OrganView, cub
     assert view._structures._parts == []
 
 
+def test_the_walls_of_a_cut_are_drawn_as_flesh(view: OrganView, cube: Organ) -> None:
+    view.show(replace(cube, walls=cube.faces[:6]), (SPHERE,))
+    parts = view._structures._parts
+    assert sum(len(part.mesh.faces) for part in parts) == 6
+    red, green, blue = np.mean([part.mesh.color for part in parts], axis=0)
+    assert red > 2.0 * max(green, blue)
+    view.show(cube, (SPHERE,))
+    assert view._structures._parts == []
+
+
 def test_a_held_shape_is_grey_until_it_is_that_of_now(view: OrganView) -> None:
     bands = [view._surface._nodes["bands", k] for k in range(N_BANDS)]
     colours = [tuple(mesh.color) for mesh in bands]

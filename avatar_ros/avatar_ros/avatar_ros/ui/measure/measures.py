@@ -43,6 +43,7 @@ class Measures:
     def __init__(self, view: MeasuresView) -> None:
         self._view = view
         self._organ: Organ | None = None
+        self._margins: dict[str, float] = {}  # of structures from the cut, at rest [m]
         self._tip: Tip | None = None
         self._body = np.zeros((1, 3))
         self._places: dict[str, list[Place]] = {}
@@ -53,6 +54,7 @@ class Measures:
     def show_organ(self, organ: Organ, tip: Tip) -> None:
         """Start with another organ, without places."""
         self._organ = organ
+        self._margins = margins(organ.vademecum)
         self.change_tip(tip)
         self.clear()
 
@@ -114,7 +116,11 @@ class Measures:
         organ = self._organ
         if organ is None or len(now.points) != len(organ.vertices):
             return []
-        lines = [*self._around_tool(organ, now), *_at_cut(organ, now), *self._at_places(organ, now)]
+        lines = [
+            *self._around_tool(organ, now),
+            *self._at_cut(organ, now),
+            *self._at_places(organ, now),
+        ]
         self._draw(now.points)
         return lines
 
@@ -131,6 +137,15 @@ class Measures:
             mark = " (nearest)" if name == nearest and len(gaps) > 1 else ""
             lines.append(f"Tool to {name}: {1e3 * found.length:.1f} mm{mark}")
         return lines
+
+    def _at_cut(self, organ: Organ, now: Now) -> list[str]:
+        if not self._margins:
+            return []
+        found = margins(organ.vademecum, now.points)
+        return [
+            f"Cut to {name}: {1e3 * rest:.1f} mm at rest, {1e3 * found[name]:.1f} mm now"
+            for name, rest in self._margins.items()
+        ]
 
     def _at_places(self, organ: Organ, now: Now) -> list[str]:
         lines, rest = [], organ.vertices.astype(float)
@@ -166,15 +181,6 @@ class Measures:
             if mode == PLANE:
                 size = 0.0 if self._organ is None else 0.6 * self._organ.size
                 self._view.plane(whole, size)
-
-
-def _at_cut(organ: Organ, now: Now) -> list[str]:
-    """Return a line for each structure on its distance from the organ's cut."""
-    rest = margins(organ.vademecum)
-    return [
-        f"Cut to {name}: {1e3 * rest[name]:.1f} mm at rest, {1e3 * found:.1f} mm now"
-        for name, found in (margins(organ.vademecum, now.points) if rest else {}).items()
-    ]
 
 
 def _compliance(organ: Organ, place: Place) -> float | None:
