@@ -159,7 +159,7 @@ def _draw_organ(axes, vademecum: Vademecum, cloud: np.ndarray, tip: np.ndarray) 
 def _draw_curve(figure, curve: ForceCurve) -> None:  # type: ignore[no-untyped-def]
     axes = figure.add_subplot(1, 2, 2)
     depth, force = 1e3 * curve.depth, curve.force
-    axes.plot(depth, force, lw=2, color="C0", label="1 kHz step")
+    axes.plot(depth, force, lw=2, color="C0", label="avatar, one step for each depth")
     axes.fill_between(
         depth,
         force - curve.error,
@@ -167,7 +167,7 @@ def _draw_curve(figure, curve: ForceCurve) -> None:  # type: ignore[no-untyped-d
         alpha=0.25,
         color="C0",
         lw=0,
-        label="its error as it is said",
+        label="estimated error of the step",
     )
     axes.plot(depth, curve.hertz, "--", lw=1.5, color="gray", label="Hertz, on a half-space")
     if curve.resolved is not None:
@@ -184,7 +184,7 @@ def _draw_curve(figure, curve: ForceCurve) -> None:  # type: ignore[no-untyped-d
 
 
 def _sentence(curve: ForceCurve) -> str:
-    tip = f"a {TIP.shape} of {1e3 * TIP.radius:g} mm"
+    tip = f"a {TIP.shape} of {1e3 * TIP.radius:g} mm radius"
     if curve.resolved is None:
         return f"The force on {tip}, pressed in at the circled place"
     step, hertz = (100 * curve.misses(force) for force in (curve.force, curve.hertz))
