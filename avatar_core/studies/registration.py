@@ -178,12 +178,13 @@ def draw_determined(axes: Axes, shown: Shown) -> None:
     x, _, z = 1e3 * shown.place.T
     drawn = axes.scatter(x, z, c=1e3 * shown.interval, s=9, cmap="viridis", vmin=0.0)
     axes.plot(*(1e3 * shown.cloud[::20, [0, 2]].T), "k.", markersize=1.5, label="cloud")
-    axes.figure.colorbar(drawn, ax=axes, label="half of the 90 % interval of the place [mm]")
+    axes.figure.colorbar(drawn, ax=axes, label="half-width of the 90 % interval [mm]")
     axes.set_aspect("equal")
+    axes.invert_xaxis()  # seen from the front: the patient's right on the left
     axes.set_xlabel("x [mm]")
     axes.set_ylabel("z [mm]")
-    axes.legend(loc="upper right", fontsize=8)
-    axes.set_title("a point force, nothing said", fontsize=9)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.3), fontsize=8)
+    axes.set_title("after one force at an unknown place", fontsize=9)
 
 
 def others_summed_up(rows: Sequence[Row]) -> dict[str, float]:
