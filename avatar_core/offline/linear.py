@@ -130,6 +130,7 @@ def build_vademecum(
             rule.is_met(last.mean, last.worst), rule.tolerance, modes.history, errors
         ).with_errors(response.errors(blocks, field, elasticity.mesh.lumped_mass)),
         provenance=provenance,
+        contrast=elasticity.inclusion.contrast if elasticity.inclusion else None,
         supports=elasticity.supports,
         display=display,
     )

@@ -72,6 +72,8 @@ def test_a_lesion_without_a_contrast_is_called_as_stiff_as_the_organ(cube: Organ
     assert "as stiff" in material_text(sick, {"young": 8e3})
     assert "as stiff" not in material_text(cube, {"young": 8e3})
     assert "as stiff" not in material_text(sick, {"young": 8e3, "contrast": 3.0})
+    built = replace(sick, vademecum=replace(cube.vademecum, contrast=4.0))
+    assert "tumour 4 x E" in material_text(built, {"young": 8e3})
 
 
 def test_three_points_on_a_line_are_no_plane() -> None:

@@ -67,7 +67,7 @@ def source_of(name: str) -> str:
 def material_text(organ: Organ, values: dict[str, float]) -> str:
     """Return the material in force, by coordinate of an organ [SI], in one line."""
     poisson = values.get("poisson", organ.vademecum.material.poisson_ratio)
-    contrast = values.get("contrast")
+    contrast = values.get("contrast", organ.vademecum.contrast)
     inside = "; as stiff inside" if organ.structures else ""
     tumour = inside if contrast is None else f", tumour {contrast:.3g} x E"
     return f"E {values['young'] / 1e3:.4g} kPa, nu {poisson:.3g}{tumour}"
