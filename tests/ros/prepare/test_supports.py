@@ -12,7 +12,7 @@ from avatar_core.scene.file import parse_scene, write_scene
 from avatar_core.scene.model import SupportStiffness, Tool
 from avatar_core.scene.prepare import scene_spec
 from avatar_core.vademecum.model import Vademecum
-from avatar_ros.loop.settings import CONTACT, MATERIAL, chosen_material
+from avatar_ros.loop.settings import CONTACT, MATERIAL, UNSET, chosen_material
 from avatar_ros.nodes.contact import ContactNode
 from avatar_ros.prepare.scenes import usable_material
 from avatar_ros.ui.session.presets import HINTS, SLIDERS
@@ -36,7 +36,7 @@ def test_every_attachment_has_a_parameter_and_a_place_on_the_page() -> None:
 
 
 def test_a_parameter_chooses_the_stiffness(organ: Vademecum) -> None:
-    given = {key: 0.0 for key in MATERIAL} | {"support.bare_area": 3e7}
+    given = UNSET | {"support.bare_area": 3e7}
     chosen = chosen_material(given)
     assert chosen == {BARE: 3e7}
     spec = scene_spec(organ, parse_scene("name: bare", "scene"), chosen)
@@ -108,7 +108,6 @@ def test_a_recording_keeps_the_stiffness_in_its_scene(organ: Vademecum) -> None:
     [
         (BARE, 3e7, {}, ""),
         (BARE, 1e10, {}, r"holds 100000 to 1e+09"),
-        (BARE, 0.0, {}, ""),
         (BARE, 1e10, {"young": 1.7e6}, ""),  # within range there: the worker decides
         ("support.falciform", 1e5, {}, "--support falciform="),
         ("young", 100.0, {}, "holds 170 to"),

@@ -11,7 +11,7 @@ import pytest
 
 from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import read_scene, shipped_scene
-from avatar_ros.loop.settings import MATERIAL
+from avatar_ros.loop.settings import MATERIAL, UNSET
 from avatar_ros.ui.session.chosen import Chosen
 from avatar_ros.ui.session.recordings import Page, Recordings
 from avatar_ros.ui.tools.tool_state import SharedToolState
@@ -49,7 +49,7 @@ def cell() -> Noted:
     there = {"material.young_modulus": 90e3}
     return Noted(
         set_material=answer_material,
-        parameters_of_contact=lambda names, then: then(dict.fromkeys(names, 0.0) | there),
+        parameters_of_contact=lambda names, then: then(UNSET | there),
         load_scene=lambda name, report, yaml, then: then(name != "refused"),
     )
 
@@ -66,6 +66,13 @@ def chosen(cell: Noted, state: SharedToolState) -> Chosen:
         faces=np.zeros((0, 3), int),
     )
     return made
+
+
+def test_a_cut_that_a_scene_opened_can_be_closed(chosen: Chosen, cell: Noted) -> None:
+    chosen.note_contact({"scene": "retract", "material.resection": UNSET["material.resection"]})
+    assert chosen.given["resection"] == 0.5
+    chosen.note_contact({"material.resection": 0.0})
+    assert chosen.given["resection"] == 0.0
 
 
 def test_a_return_is_taken_back_as_a_whole(chosen: Chosen, cell: Noted) -> None:

@@ -133,9 +133,10 @@ CONTACT = (
     ),
     Parameter(
         "material.resection",
-        0.0,
-        "opened part of the organ's cut, if it is a coordinate: 0 (whole) to 1 (opened)",
-        range=(0.0, 1.0),
+        -1.0,
+        "opened part of the organ's cut, if it is a coordinate: 0 (whole) to 1 (opened); -1: that "
+        "of the vademecum",
+        range=(-1.0, 1.0),
         read_only=False,
     ),
     *(
@@ -200,6 +201,8 @@ MATERIAL = {
     "material.resection": RESECTION,
     **{SUPPORT + name: SUPPORT + name for name in ATTACHMENTS},
 }
+# values by which they choose nothing; a cut may be closed, to 0
+UNSET = {key: -1.0 if name == RESECTION else 0.0 for key, name in MATERIAL.items()}
 
 
 @dataclass(frozen=True)
@@ -302,7 +305,7 @@ def _tip(shape: Any, radius: Any, half_angle: Any, rounding: Any) -> Tip:
 
 def chosen_material(value: dict[str, Any]) -> dict[str, float]:
     """Return the values of the material that differ from the vademecum's, by coordinate."""
-    return {name: value[key] for key, name in MATERIAL.items() if value[key] != 0.0}
+    return {name: value[key] for key, name in MATERIAL.items() if value[key] != UNSET[key]}
 
 
 def chosen_known(value: str) -> dict[str, Distribution]:

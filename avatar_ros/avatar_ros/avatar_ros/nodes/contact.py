@@ -48,6 +48,7 @@ from avatar_ros.loop.settings import (
     CHANGEABLE,
     CONTACT,
     MATERIAL,
+    UNSET,
     LoopSettings,
     chosen_budget,
     chosen_known,
@@ -347,12 +348,13 @@ class ContactNode(ManagedNode):
             name = MATERIAL.get(change.name)
             if name is None:
                 continue
+            material.pop(name, None)
+            if change.value == UNSET[change.name]:
+                continue
             refusal = self._refusal_of(name, change.value, settings.material)
             if refusal:
                 return SetParametersResult(successful=False, reason=refusal)
-            material.pop(name, None)
-            if change.value != 0.0:
-                material[name] = change.value
+            material[name] = change.value
         try:
             if budget != settings.budget and loop.active.shown_modes is not None:
                 loop.active.shown_modes.keep(budget)
@@ -403,7 +405,7 @@ class ContactNode(ManagedNode):
         are
         changed, the worker process decides.
         """
-        if value == 0.0 or self._ranges is None or (name == "young" and name not in self._ranges):
+        if self._ranges is None or (name == "young" and name not in self._ranges):
             return ""
         if name not in self._ranges:
             return f"the vademecum has no coordinate {name}; build it with {option_of(name)}"

@@ -12,7 +12,7 @@ from avatar_core.errors import AvatarError
 from avatar_core.geometry.tip import Tip
 from avatar_core.scene.file import read_scene, shipped_scenes, write_scene
 from avatar_core.scene.model import Scene, Tool
-from avatar_ros.loop.settings import MATERIAL, chosen_tips
+from avatar_ros.loop.settings import MATERIAL, UNSET, chosen_tips
 from avatar_ros.prepare.scenes import scene_file
 from avatar_ros.ui.session.presets import values_of
 from avatar_ros.ui.session.recorder import scene_in_force
@@ -138,7 +138,11 @@ class Chosen:
     def in_force(self) -> dict[str, float]:
         """Return the values of the material that differ from the file's, by coordinate [SI]."""
         contact = self.contact
-        given = {MATERIAL[key]: contact[key] for key in MATERIAL if contact.get(key)}
+        given = {
+            name: contact[key]
+            for key, name in MATERIAL.items()
+            if contact.get(key, UNSET[key]) != UNSET[key]
+        }
         return given | self._material
 
     def values(self, organ: Organ) -> dict[str, float]:
