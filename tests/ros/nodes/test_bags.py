@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from avatar_core.bags.compare import comparable
@@ -30,6 +31,7 @@ from tests.helpers.slowness import Deadline
 pytestmark = pytest.mark.long  # it builds an organ and starts nodes
 
 SECONDS = 4  # one touch
+LEAST = 250  # periods of it whose force was sent as computed
 _BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 _RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 TOPICS = {
@@ -69,19 +71,31 @@ class Recorder:
                     writer.write(connection, received, content)
         return folder
 
+    def forget(self) -> None:
+        for topic in set(TOPICS) - {"/vademecum_info"}:  # which is sent once
+            self.taken[topic].clear()
+
+    @property
+    def n_unaltered(self) -> int:
+        """Number of states in contact whose force was sent as computed."""
+        states = [deserialize_message(c, ContactState) for _, c in self.taken["/contact_state"]]
+        return sum(bool(s.contacts) and s.force_share == 1.0 for s in states)
+
 
 @pytest.fixture(scope="module")
 def recorder(cell: Any, lasting_probe: Any, library: Path, own_domain: dict[str, str]) -> Recorder:
-    """Record one touch of the scripted tool."""
+    """Record one touch of the scripted tool; again if a busy machine altered its forces."""
     recorder = Recorder(lasting_probe.node)
     lasting_probe.next(ContactState, "contact_state", qos.state(1), lambda s: s.vademecum_id)
-    arguments = [str(library / "liver.h5"), "--seconds", str(SECONDS)]
-    tool, passed = Module("bench.scripted_tool", arguments, own_domain), Deadline(120.0)
-    while tool.poll() is None:
-        assert not passed, "the tool does not end"
-        recorder.take()
-        time.sleep(1e-3)
-    assert tool.finish() == 0
+    arguments, passed = [str(library / "liver.h5"), "--seconds", str(SECONDS)], Deadline(120.0)
+    while recorder.n_unaltered <= LEAST:
+        recorder.forget()
+        tool = Module("bench.scripted_tool", arguments, own_domain)
+        while tool.poll() is None:
+            assert not passed, "no touch in which forces are sent as computed"
+            recorder.take()
+            time.sleep(1e-3)
+        assert tool.finish() == 0
     return recorder
 
 
@@ -109,6 +123,5 @@ def test_a_bag_of_a_cell_is_replayed(
     assert bag.vademecum_ids == (organ.id,) and not bag.notes
     assert path.answers == ("states" if states else "wrenches")
     assert size.max() > 0.1
-    # on a busy machine, the force guard may alter forces all the time
     assert known.sum() > 200 if states else found.known.any()
     assert found.difference(path.recording) <= 1e-9
