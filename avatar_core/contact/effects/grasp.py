@@ -6,7 +6,7 @@ with the tool, like a bonded disc of the jaw's radius a. With y its motion since
     g = [C(s, s) - c L + L / (2 E* a)]^-1 (y - u),      L = n n^T + rho (I - n n^T).
 
 Here g is the force on the tissue, C the organ's compliance for a patch, and u the displacement by
-all other causes. c is the dent of a patch in its own neighbourhood (:mod:`avatar_core.tips.law`). A
+all other causes. c is the dent of a patch in its own neighborhood (:mod:`avatar_core.tips.law`). A
 disc that is bonded to a half-space yields by 1 / (2 E* a) along n, and along the surface by (2 -
 nu) / (8 G a) = rho / (2 E* a), rho = (2 - nu) / (2 (1 - nu)) (Mindlin, J. Appl. Mech. 16:259, 1949;
 exact without friction, and for nu = 1/2). All tools are solved for together, which is the
