@@ -12,7 +12,7 @@ import typer
 
 from avatar_core.cli.bench import require_ros
 from avatar_core.cli.numbers import ToolTransform, pose_of
-from avatar_core.cli.output import require_output
+from avatar_core.cli.output import Replace, require_output
 from avatar_core.cli.progress import progress_bar
 from avatar_core.cli.uncertainty import given_of
 from avatar_core.cli.vademecum import File, require, say_notices
@@ -85,6 +85,7 @@ def calibrate(
     set_them: Annotated[
         bool, typer.Option("--set", help="set the values in the running contact node")
     ] = False,
+    overwrite: Replace = False,
 ) -> None:
     """Find material values from measured forces.
 
@@ -98,8 +99,9 @@ def calibrate(
     from avatar_core.vademecum.storage import load_vademecum
 
     for one in output or []:
-        require_output(one, _FORMATS, [file, recording])
+        require_output(one, _FORMATS, [file, recording], overwrite=overwrite)
     require(0.0 < sensor < 1.0, f"--sensor is {sensor}; give a fraction of the force, e.g. 0.02")
+    require(1.0 <= radius <= 20.0, f"--radius is {radius:g} mm; give 1 to 20")
     require(least > 0.0, f"--least is {least} N; give a positive force")
     require(0.0 <= depth <= 20.0, f"--depth is {depth} mm; give 0 to 20")
     require(0.0 <= extent <= 1.0, f"--extent is {extent}; give a fraction of the value, 0 to 1")

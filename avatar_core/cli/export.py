@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from avatar_core.cli.numbers import numbers
-from avatar_core.cli.output import require_output
+from avatar_core.cli.output import Replace, require_output
 from avatar_core.cli.vademecum import require
 
 if TYPE_CHECKING:
@@ -48,6 +48,7 @@ def export(
     axes: Annotated[
         str, typer.Option(help="axes of surfaces: LPS or RAS, stated in the file's header")
     ] = "LPS",
+    overwrite: Replace = False,
 ) -> None:
     """Export an organ for ParaView or 3D Slicer.
 
@@ -58,13 +59,20 @@ def export(
     from avatar_core.contact.tool_path import middle_of_access
     from avatar_core.geometry.surface import METRES
     from avatar_core.scene.export import DISPLACEMENT, FORMATS, organ_mesh, write_mesh
-    from avatar_core.scene.surface_export import AXES, SURFACE_FORMATS, displaced, write_surfaces
+    from avatar_core.scene.surface_export import (
+        AXES,
+        SURFACE_FORMATS,
+        displaced,
+        parts_of,
+        write_surfaces,
+    )
     from avatar_core.vademecum.storage import load_vademecum
 
     require(modes >= 0, f"--modes is {modes}; ask for 0 or more")
     require(unit in METRES, f"--unit is {unit}; choose {', '.join(METRES)}")
     require(axes in AXES, f"--axes is {axes}; choose {' or '.join(AXES)}")
-    require_output(output, [*FORMATS, *SURFACE_FORMATS, MCAP], [file])
+    suffixes = [*FORMATS, *SURFACE_FORMATS, MCAP]
+    require_output(output, suffixes, [file], overwrite=overwrite)
     if output.suffix == MCAP:
         _export_recording(file, output)
         return
@@ -80,6 +88,8 @@ def export(
         print(f"{output}: {len(mesh.points)} vertices, {n_modes} modes, at rest, in m and RAS")
     else:
         displacement = vademecum.displacement_at(point, newtons)
+        for path in parts_of(vademecum, output):
+            require_output(path, suffixes, [file], overwrite=overwrite)
         points = displaced(vademecum, displacement)
         written = write_surfaces(vademecum, output, points, unit, axes)
         for path, (vertices, _) in written.items():

@@ -17,6 +17,14 @@ Overwrite = Annotated[
     bool,
     typer.Option("--overwrite", help="replace a file that is there, even if it is no vademecum"),
 ]
+Replace = Annotated[bool, typer.Option("--overwrite", help="replace files that are there")]
+
+PICTURES = (".png", ".pdf", ".svg")
+
+
+def measured(_: Path) -> bool:
+    """Return that a table of times may be replaced, like a picture."""
+    return True
 
 
 def require_output(
@@ -31,8 +39,7 @@ def require_output(
     output : file to write
     suffixes : allowed ends of its name
     inputs : files that are read. They are never replaced, whatever name or link leads to them.
-    replaces : function that returns whether an existing file may be replaced; None: any file of
-        that suffix
+    replaces : function that returns whether an existing file may be replaced; None: any picture
     overwrite : replace any file but an input
     """
     suffixes = tuple(suffixes)
@@ -44,11 +51,12 @@ def require_output(
     for source in inputs:
         if source is not None and same_file(output, source):
             raise StorageError(f"{output} is also read ({source}); give another name")
-    there = os.path.lexists(output)
-    if there and not overwrite and replaces is not None and not replaces(output):
-        raise StorageError(
-            f"{output} exists and is no vademecum; give another name, or --overwrite to replace it"
-        )
+    if not os.path.lexists(output) or overwrite:
+        return
+    may = output.suffix in PICTURES if replaces is None else replaces(output)
+    if not may:
+        what = "exists" if replaces is None else "exists and is no vademecum"
+        raise StorageError(f"{output} {what}; give another name, or --overwrite to replace it")
 
 
 def require_output_folder(output: Path) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from avatar_core.cli.numbers import numbers
-from avatar_core.cli.output import require_output
+from avatar_core.cli.output import Replace, require_output
 from avatar_core.cli.vademecum import AsJson, Axes, File, Unit, parsed_axes, require, say_notices
 from avatar_core.common.dataclass_json import plain
 from avatar_core.geometry.surface_formats import MESH_NAMES
@@ -105,6 +105,7 @@ def register(
         ),
     ] = None,
     as_json: AsJson = False,
+    overwrite: Replace = False,
 ) -> None:
     """Register an organ to points on its surface.
 
@@ -116,10 +117,11 @@ def register(
     from avatar_core.registration.fit import RegistrationRule
     from avatar_core.registration.register import register as registered_to
     from avatar_core.scene.export import FORMATS
-    from avatar_core.scene.surface_export import SURFACE_FORMATS
+    from avatar_core.scene.surface_export import SURFACE_FORMATS, parts_of
     from avatar_core.vademecum.storage import load_vademecum
 
-    require_output(output, [*SURFACE_FORMATS, *FORMATS], [file, points])
+    suffixes = [*SURFACE_FORMATS, *FORMATS]
+    require_output(output, suffixes, [file, points], overwrite=overwrite)
     require(frame in FRAMES, f"--frame is {frame}; choose {' or '.join(FRAMES)}")
     require(kind is None or kind in KINDS, f"--kind is {kind}; choose {', '.join(KINDS)}")
     known = frame == "known"
@@ -137,6 +139,8 @@ def register(
     cloud = read_cloud(points, unit, parsed_axes(axes))
     say_notices(cloud.notices)
     vademecum = load_vademecum(file)
+    for path in parts_of(vademecum, output) if output.suffix in SURFACE_FORMATS else ():
+        require_output(path, suffixes, [file, points], overwrite=overwrite)
     found = registered_to(vademecum, cloud, rule)
     say_notices(tuple(line for line in found.notices if line not in cloud.notices))
     given = [] if target is None else [found.target_at(target)]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from avatar_core.cli.output import require_output
+from avatar_core.cli.output import measured, require_output
 from avatar_core.common.processes import cpu_seconds
 from avatar_core.errors import StorageError, one_line
 
@@ -72,7 +72,7 @@ class StageClock:
 def require_timings(file: Path | None) -> None:
     """Raise StorageError unless times can be written to the file, if there is one."""
     if file is not None:
-        require_output(file, [".json"], ())
+        require_output(file, [".json"], (), measured)
 
 
 def show_timings(clock: StageClock, file: Path | None) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from avatar_core.cli.numbers import numbers
-from avatar_core.cli.output import require_output
+from avatar_core.cli.output import Replace, require_output
 from avatar_core.cli.progress import progress_bar
 from avatar_core.cli.vademecum import File, require
 
@@ -54,6 +54,7 @@ def uncertainty(
         Path | None, typer.Option("-o", "--output", help="write numbers (.json) or a picture")
     ] = None,
     seed: Annotated[int, typer.Option(help="seed of the draws")] = 0,
+    overwrite: Replace = False,
 ) -> None:
     """Show bands of force and displacement.
 
@@ -68,7 +69,8 @@ def uncertainty(
 
     require(20 <= draws <= 1_000_000, f"--draws is {draws}; give 20 to 1,000,000")
     if output is not None:
-        require_output(output, _FORMATS, [file])
+        require_output(output, _FORMATS, [file], overwrite=overwrite)
+    require(1.0 <= radius <= 20.0, f"--radius is {radius:g} mm; give 1 to 20")
     pressed = _depths(depths)
     tip = Tip("sphere", 1e-3 * radius)
     known = given_of(given)

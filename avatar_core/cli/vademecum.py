@@ -69,7 +69,9 @@ Supports = Annotated[
         "repeated",
     ),
 ]
-Vertices = Annotated[int, typer.Option(help="approximate number of mesh vertices")]
+Vertices = Annotated[
+    int, typer.Option(help="approximate number of mesh vertices; a surface may need more")
+]
 
 
 def vademecum(

@@ -68,17 +68,22 @@ def write_surfaces(
     signs = np.array([-1.0, -1.0, 1.0] if axes == "LPS" else [1.0, 1.0, 1.0])
     points = points * signs
     values = {k: v * signs if v.ndim == 2 else v for k, v in (fields or {}).items()}
-    parts = {path: vademecum.organ_faces}
-    for name, faces in vademecum.structures.items():
-        parts[path.with_name(f"{path.stem}_{_plain(name)}{path.suffix}")] = faces
     written = {}
-    for file, faces in parts.items():
+    for file, faces in parts_of(vademecum, path).items():
         used, local = np.unique(faces, return_inverse=True)
         written[file] = points[used], local.reshape(faces.shape)
         with replaced(file) as whole:
             own = {name: value[used] for name, value in values.items()}
             SURFACE_FORMATS[path.suffix](whole, *written[file], axes, own)
     return written
+
+
+def parts_of(vademecum: Vademecum, path: Path) -> dict[Path, np.ndarray]:
+    """Return file and faces of the organ, and of each structure inside."""
+    parts = {path: vademecum.organ_faces}
+    for name, faces in vademecum.structures.items():
+        parts[path.with_name(f"{path.stem}_{_plain(name)}{path.suffix}")] = faces
+    return parts
 
 
 def displaced(vademecum: Vademecum, displacement: np.ndarray) -> np.ndarray:

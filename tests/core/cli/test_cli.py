@@ -108,7 +108,7 @@ def test_bad_option(refused: Any, tmp_path: Path, options: list[str], remedy: st
     ("change", "remedy"),
     [
         (None, "cannot read the resection"),
-        ({"point": [1.0, 0.0, 0.0]}, "give a surface through the organ"),
+        ({"point": [1.0, 0.0, 0.0]}, "give a surface in metres through the organ"),
         ({"open_along": [1.0, 0.0, 0.0]}, "opens along its own normal"),
         # across the direction from the clamp to the front
         (
@@ -358,6 +358,10 @@ PATIENT = "patient liver.obj --atlas folder.h5 -o"
         ("export v.h5 -o v.h5", "choose .vtu or .xdmf"),
         ("export v.h5 -o link.vtu", "is also read (v.h5)"),
         ("export v.h5 -o no/v.vtu", "create it first"),
+        ("export v.h5 -o tumour.obj", "exists; give another name, or --overwrite"),
+        ("register v.h5 --points liver.obj -o tumour.obj", "exists; give another name"),
+        ("calibrate v.h5 --recording v.h5 -o old.json", "exists; give another name"),
+        ("uncertainty v.h5 --given young=fixed:5e3 -o old.json", "exists; give another name"),
         ("bench step liver.obj -o liver.obj", "choose .json"),
         ("bench step liver.obj -o link.json", "is also read (liver.obj)"),
         ("bench effects liver.obj -o no/e.json", "create it first"),
@@ -382,7 +386,7 @@ def test_refused_before_anything_is_computed(said, tmp_path, command, reason):  
         f"{PATIENT} text.h5 --overwrite",
         "atlas create new liver.obj",
         "export v.h5 -o new.xdmf",
-        "export v.h5 -o old.vtu",
+        "export v.h5 -o old.vtu --overwrite",
         "bench step liver.obj -o old.json",
         "bench step v.h5",
         "demo -o new.png --vertices 500",
