@@ -41,7 +41,7 @@ from avatar_core.offline.linear import build_vademecum
 from avatar_core.offline.parametric import build_parametric_vademecum
 from avatar_core.offline.rule import NO_ERROR, BuildRule, Progress, silent
 from avatar_core.offline.supports import SupportOption, held_by
-from avatar_core.reduction.coordinates import RESECTION, Coordinate
+from avatar_core.reduction.coordinates import LIMITS, RESECTION, Coordinate
 from avatar_core.vademecum.display import DISPLAYED, organ_display
 from avatar_core.vademecum.large_deformation import LargeMaterial
 from avatar_core.vademecum.model import Vademecum
@@ -152,10 +152,13 @@ class OrganOptions:
         held = [s.name for s in self.supports]
         if len(set(held)) < len(held):
             raise CoordinateError(f"a support is given twice: {', '.join(held)}")
-        if "contrast" in names and self.tumour is None:
+        if ("contrast" in names or self.contrast != 1.0) and self.tumour is None:
             raise CoordinateError(
                 "the contrast is that of a tumour; give its surface with --tumour"
             )
+        low, high = LIMITS["contrast"]
+        if not low <= self.contrast <= high:
+            raise CoordinateError(f"the contrast is {self.contrast:g}; give {low:g} to {high:g}")
         if self.large and (self.all_coordinates or self.tumour or self.supports):
             raise CoordinateError(
                 "large deformation is not combined with a tumour, supports or coordinates of the "

@@ -468,7 +468,7 @@ def _warnings(
     away = weights.hull_distance / max(float(weights.distances.mean()), 1e-300)
     if weights.member is not None:
         lines.append(f"the patient is {base.names[weights.member]} of the base")
-    elif away > _FAR_HULL:
+    elif away > _FAR_HULL and fidelity != "solved":
         lines.append(
             f"the patient lies outside the hull of the neighbors, by {away:.2g} of the mean "
             "distance to them; trust 'interpolated' less, or add similar anatomies"

@@ -28,7 +28,7 @@ def certify_range(
     """
     assert vademecum.parametric is not None
     values = _certified_values(vademecum.parametric.coordinates, seed)
-    n_each = max(1, n_loads // len(values))
+    n_each = -(-n_loads // len(values))  # rounded up
     found = []
     for k, point in enumerate(values):
         here = vademecum.at(point)

@@ -11,7 +11,7 @@ is the largest opened fraction of the cut's area (all of it by default).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from scipy.special import comb
 from avatar_core.common.arrays import FloatArray
 from avatar_core.common.dataclass_json import of_plain, parsed
 from avatar_core.common.files import FileError, content_of, opened
-from avatar_core.errors import AvatarError, MeshError
+from avatar_core.errors import MeshError, StorageError
 
 MAX_BYTES = 1 << 20
 _ALONG_NORMAL = 0.98  # cosine of 11 degrees to the normal, from which nothing is left to open along
@@ -102,9 +102,12 @@ class CutSurface:
             return of_plain(cls, parsed(text, "resection"), "resection")
         except (FileError, UnicodeDecodeError) as error:
             raise MeshError(f"cannot read the resection {path} ({error})") from error
-        except AvatarError as error:
-            reason = str(error).removesuffix("; build the file again")
-            raise MeshError(f"resection {path}: {reason}") from error
+        except StorageError as error:
+            reason = str(error).rpartition(";")[0] or str(error)  # its remedy is for our own files
+            keys = ", ".join(field.name for field in fields(cls))
+            raise MeshError(f"resection {path}: {reason}; write JSON with {keys}") from error
+        except MeshError as error:
+            raise MeshError(f"resection {path}: {error}") from error
 
     @cached_property
     def mean_normal(self) -> FloatArray:

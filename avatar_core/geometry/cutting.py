@@ -46,7 +46,8 @@ def snapped(mesh: TetMesh, surface: CutSurface) -> tuple[TetMesh, np.ndarray]:
     if min(volumes) < _LEAST_PART * mesh.volume:
         raise MeshError(
             f"the resection cuts off {1e6 * min(volumes):.1f} ml of {1e6 * mesh.volume:.0f} ml; "
-            f"give a surface through the organ, whose centroid is at {_text(mesh.centroid)} m (RAS)"
+            "give a surface in metres through the organ, whose centroid is at "
+            f"{_text(mesh.centroid)} m (RAS)"
         )
     between = np.intersect1d(mesh.tets[second], mesh.tets[~second])
     for _ in range(_SWEEPS):

@@ -137,6 +137,10 @@ def parsed(
     try:
         if is_label_map(path):
             return surface_of_label(path, label, inside, is_organ, mm)
+        if label is not None:
+            raise SurfaceError(
+                f"{path.name} is a surface, which has no label {label}; leave it out"
+            )
         return _FORMATS[kind].read(content_of(path).removeprefix(BYTE_ORDER_MARK)), ()
     except SurfaceError:
         raise

@@ -35,7 +35,7 @@ RESECTION = "resection"
 # Between nodes no farther apart, in the scales above, interpolation adds nothing to the error that
 # can be measured (`avatar study coordinates`).
 _SPACING = {"poisson": 2.4, "contrast": 1.9, "support": 3.1, RESECTION: 0.2}
-_LIMITS = {
+LIMITS = {
     "poisson": (0.0, 0.4999),
     "contrast": (0.01, 100.0),
     "support": (LEAST_STIFFNESS, MOST_STIFFNESS),
@@ -77,12 +77,12 @@ class Coordinate:
     n_nodes: int = 0
 
     def __post_init__(self) -> None:
-        if self.kind not in _LIMITS or self.name == "support":
+        if self.kind not in LIMITS or self.name == "support":
             raise CoordinateError(
                 f"coordinate '{self.name}' is unknown; there are poisson, contrast, "
                 "support.NAME and resection"
             )
-        least, most = _LIMITS[self.kind]
+        least, most = LIMITS[self.kind]
         if not least <= self.low < self.high <= most:
             raise CoordinateError(
                 f"coordinate {self.name}={self.low:g}:{self.high:g}: give LOW:HIGH with "
@@ -186,9 +186,16 @@ def require_known(coordinates: Sequence[Coordinate], values: Mapping[str, float]
     for name in values:
         if name not in names:
             raise CoordinateError(
-                f"this vademecum has no coordinate '{name}'{others}; build it with "
-                f"{option_of(name)}"
+                f"this vademecum has no coordinate '{name}'{others}; {remedy(name)}"
             )
+
+
+def remedy(name: str) -> str:
+    """Return how to get a coordinate, or the names that there are."""
+    kind = SUPPORT if name.startswith(SUPPORT) else name
+    if kind.rstrip(".") in LIMITS:
+        return f"build it with {option_of(name)}"
+    return f"coordinates are {', '.join(LIMITS)}".replace("support", f"{SUPPORT}NAME")
 
 
 def option_of(name: str) -> str:

@@ -255,6 +255,9 @@ def _columns(name: str, content: bytes) -> FloatArray:
             f"{name}: its {n} columns are called '{titles[-1].strip()[:60]}'; call three x, y and z"
         )
     chosen = named[-1] if named else [0, 1, 2]
+    short = next((row for row in rows if len(row) <= max(chosen)), None)
+    if short is not None:
+        raise RegistrationError(f"{name}: '{' '.join(short)[:40]}' is no point; give x, y, z")
     points = np.array([[float(row[k]) for k in chosen] for row in rows], np.float64).reshape(-1, 3)
     if not named and n > 3 and len(points) > 1 and (np.diff(points[:, 0]) >= 0.0).all():
         raise RegistrationError(

@@ -14,7 +14,7 @@ import numpy as np
 from avatar_core.common.dataclass_json import of_plain, plain
 from avatar_core.common.supports import SUPPORT
 from avatar_core.errors import CoordinateError
-from avatar_core.reduction.coordinates import Coordinate, fixed_support, option_of
+from avatar_core.reduction.coordinates import RESECTION, Coordinate, fixed_support, remedy
 from avatar_core.uncertainty.distributions import Distribution, Fixed, LogUniform, Uniform, within
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ class Held:
             "young": material.young_modulus,
             "poisson": material.poisson_ratio,
             "contrast": vademecum.contrast or 1.0,
+            RESECTION: vademecum.resection.opened if vademecum.resection else 0.0,
             **{SUPPORT + support.name: support.stiffness for support in vademecum.supports},
         }
         chosen = {c.name for c in coordinates}
@@ -87,8 +88,7 @@ class Held:
         for name in given:
             if name not in names:
                 raise CoordinateError(
-                    f"this vademecum has no '{name}' but {', '.join(names)}; build it with "
-                    f"{option_of(name)}"
+                    f"this vademecum has no '{name}' but {', '.join(names)}; {remedy(name)}"
                 )
         young = given.get("young", Fixed(self.own["young"]))
         if young.cdf(0.0) > 0.0:

@@ -22,6 +22,8 @@ from avatar_core.reduction.coordinates import Coordinate, problem_at
 from avatar_core.scene.file import parse_scene, write_scene
 from avatar_core.scene.model import Scene
 from avatar_core.scene.prepare import scene_spec
+from avatar_core.uncertainty.distributions import Fixed
+from avatar_core.uncertainty.known import known_of
 from avatar_core.vademecum.modal_mass import sag_of
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.resected import margins, part_volumes
@@ -96,6 +98,12 @@ def test_young_modulus_divides_every_displacement_of_an_opened_organ(organ: Vade
     stiff = organ.at(resection=0.5)
     soft = organ.at(resection=0.5, young=young / 2.0)
     np.testing.assert_allclose(soft.compliance(*where), 2.0 * stiff.compliance(*where), rtol=1e-4)
+
+
+def test_its_opening_is_known_where_the_material_is_not(organ: Vademecum) -> None:
+    young = Fixed(5e3)
+    assert known_of(organ, {"young": young}) == {"young": young, "resection": Fixed(0.0)}
+    assert known_of(organ, {"resection": Fixed(0.5)})["resection"] == Fixed(0.5)
 
 
 def test_a_scene_chooses_the_opening(organ: Vademecum) -> None:

@@ -166,6 +166,8 @@ def test_a_band_of_young_is_that_of_the_force(phantom_vademecum: Vademecum) -> N
 def test_what_a_vademecum_does_not_have_is_refused(phantom_vademecum: Vademecum) -> None:
     with pytest.raises(CoordinateError, match="no 'poisson' but young; build it with --coord"):
         known_of(phantom_vademecum, {"poisson": Uniform(0.4, 0.45)})
+    with pytest.raises(CoordinateError, match=r"no 'contrst' .*coordinates are poisson, contrast"):
+        known_of(phantom_vademecum, {"contrst": Uniform(0.4, 0.45)})
     with pytest.raises(CoordinateError, match="may be negative"):
         known_of(phantom_vademecum, {"young": Uniform(-1.0, 5.0)})
 
