@@ -67,6 +67,7 @@ _ORIGIN = {
     "calibrate": "uncertainty.calibration",
     "create_atlas": "atlas.growth",
     "effects": "contact.effects:",
+    "estimate_error": "contact.model",
     "export": "scene.export",
     "extend_atlas": "atlas.growth",
     "load": "vademecum.storage:load_vademecum",
@@ -107,6 +108,7 @@ if TYPE_CHECKING:
     from avatar_core.contact.many import step_many as step_many
     from avatar_core.contact.model import ContactData as ContactData
     from avatar_core.contact.model import ContactModel as ContactModel
+    from avatar_core.contact.model import estimate_error as estimate_error
     from avatar_core.contact.model import step as step
     from avatar_core.contact.status import Status as Status
     from avatar_core.errors import AvatarError as AvatarError

@@ -20,7 +20,8 @@ OUT = kind(
     "Out",
     force=array("T 3"),  # force of the organ on each tool [N],
     torque=array("T 3"),  # torque about its pose [N m]: of friction, and of a punch that leans
-    force_error=array("T"),  # error that one contact in ten exceeds [N], by `estimate_error`
+    # error that one contact in ten exceeds [N], by `estimate_error`; NaN before
+    force_error=array("T", start=float("nan")),
     status=array("T", np.int64),  # status of each tool
     cloud=array("V 6", np.float32),  # deformed position and displacement [m]
     n_contacts=array("1", np.int64),

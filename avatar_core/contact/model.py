@@ -280,5 +280,15 @@ def estimate_error(model: ContactModel, data: ContactData) -> None:
     One contact in ten exceeds it; see :mod:`avatar_core.vademecum.force_error`. It is NaN where the
     vademecum was not measured. Real-time safe, like :func:`step`; separate, so that it can follow
     the sending of the forces.
+
+    Examples
+    --------
+    >>> model = av.prepare(v, av.Scene(effects=()))
+    >>> data = model.data()
+    >>> for depth in np.linspace(-5e-3, 2e-3, 50):  # a sphere of 5 mm comes down
+    ...     status = av.step(model, data, point + (5e-3 - depth) * normal)
+    >>> av.estimate_error(model, data)
+    >>> bool(0.0 < data.out.force_error[0] < np.linalg.norm(data.out.force[0]))
+    True
     """
     model.compiled.error(model.table, data.table)
