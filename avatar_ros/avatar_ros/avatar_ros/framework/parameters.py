@@ -52,7 +52,8 @@ class Parameter:
         """Describe the accepted values, e.g. for an error message."""
         kind = "a number with a decimal point" if isinstance(self.default, float) else "a value"
         bounds = f" from {self.range[0]:g} to {self.range[1]:g}" if self.range else ""
-        return f"{kind}{bounds} like {self.default!r}"
+        quoted = ", in quotes if it is off" if "off" in self.description.split() else ""
+        return f"{kind}{bounds} like {self.default!r}{quoted}"
 
 
 def declare(node: Node, parameters: tuple[Parameter, ...]) -> None:

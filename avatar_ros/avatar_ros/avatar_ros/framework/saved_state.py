@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,8 @@ class SavedState:
         folder = os.path.expanduser(node.get_parameter(STATE_DIR.name).value)
         if not folder:
             return
+        with suppress(OSError):
+            os.makedirs(folder, exist_ok=True)
         if not os.path.isdir(folder) or not os.access(folder, os.W_OK):
             raise ParameterError(
                 f"parameter state_dir: {folder} is no directory that can be written to"

@@ -47,13 +47,14 @@ class Faults:
     @property
     def text(self) -> str:
         """Return cause and remedy in one line; empty without a fault."""
-        status = self.status
+        status, said = self.status, self.said
         if status not in EXPLANATIONS:
+            said = ""  # the device says something else now
             entered = [key for key in self.counts if key in EXPLANATIONS]
             status = max(entered, key=lambda key: self.counts[key], default=int(Status.OK))
         if status not in EXPLANATIONS:
             return ""
-        detail = f"it says {self.said}" if self.said and status in OF_DEVICE else ""
+        detail = f"it says {said}" if said and status in OF_DEVICE else ""
         if status == Status.SEVERAL_PUBLISHERS:
             detail = ", ".join(self.senders)
         force = "" if status in _WITH_FORCE else "no force: "

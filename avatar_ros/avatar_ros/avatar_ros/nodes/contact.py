@@ -65,6 +65,7 @@ from avatar_ros.prepare.supplier import SUPERSEDED, ModelSupplier
 
 _BUDGET = ("accuracy.tolerance", "accuracy.quantity", "accuracy.deadline")
 _GRACE = 0.1  # time for which a replaced model is kept after the last step that uses it [s]
+_LEAST_YOUNG = 1.0  # [Pa], as in a scene
 
 
 class ContactNode(ManagedNode):
@@ -405,6 +406,8 @@ class ContactNode(ManagedNode):
         are
         changed, the worker process decides.
         """
+        if name == "young" and value < _LEAST_YOUNG:
+            return f"young is {value:g} Pa; give {_LEAST_YOUNG:g} or more"
         if self._ranges is None or (name == "young" and name not in self._ranges):
             return ""
         if name not in self._ranges:

@@ -17,6 +17,8 @@ from avatar_ros.framework import qos
 from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import AUTOSTART, Parameter
 
+_REPEATED = 1.0  # time for which no effort is sent again [s]
+
 EFFORT_BRIDGE = (
     AUTOSTART,
     Parameter(
@@ -74,9 +76,12 @@ class EffortBridge(ManagedNode):
         self._send([force.x, force.y, force.z, torque.x, torque.y, torque.z])
 
     def _watch(self) -> None:
-        if self._heard and time.monotonic() - self._heard > self.get_parameter("timeout").value:
-            self._heard = 0.0
+        """Send no effort for a second after the last wrench: a message may be lost."""
+        silent = time.monotonic() - self._heard
+        if self._heard and silent > self.get_parameter("timeout").value:
             self._send([])
+            if silent > self.get_parameter("timeout").value + _REPEATED:
+                self._heard = 0.0
 
     def _send(self, efforts: list[float]) -> None:
         n = self.get_parameter("axes").value
