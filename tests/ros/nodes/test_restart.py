@@ -212,7 +212,11 @@ def test_a_full_disk_is_named_and_leaves_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_directory_that_is_none_is_refused(tmp_path: Path) -> None:
-    node: Any = Started(tmp_path / "nowhere")
+def test_a_directory_is_made_and_a_file_is_refused(tmp_path: Path) -> None:
+    node: Any = Started(tmp_path / "new" / "state")
+    SavedState(node, {"a": 1}).save({"a": 2})
+    assert list((tmp_path / "new" / "state").iterdir())
+    (tmp_path / "file").touch()
+    taken: Any = Started(tmp_path / "file")
     with pytest.raises(ParameterError, match="no directory"):
-        SavedState(node, {})
+        SavedState(taken, {})
