@@ -17,7 +17,6 @@ from avatar_core.bags.read import ABOUT, POSES, STATES, About
 from avatar_core.common.arrays import FloatArray
 from avatar_core.common.files import replaced
 from avatar_core.contact.status import PLACED
-from avatar_core.errors import StorageError
 from avatar_core.scene.recording import Recording
 from avatar_core.scene.replay import scene_of
 
@@ -25,7 +24,7 @@ _METADATA_VERSION = 9  # version of rosbag2 in Jazzy
 
 
 def write_mcap(recording: Recording, path: str | Path) -> None:
-    """Write a recording as one MCAP file, which appears complete or not at all.
+    """Write a recording as one MCAP file, which appears complete, replaces another, or not at all.
 
     Topics are ``/NAME/measured_cp``, ``/NAME/servo_cf`` (the sent force) and ``/contact_state``
     (the computed force, as one contact at the tip). ``/recording`` comes once (scene and vademecum,
@@ -34,11 +33,9 @@ def write_mcap(recording: Recording, path: str | Path) -> None:
     Raises
     ------
     StorageError
-        If rosbags is missing, the file exists or cannot be written.
+        If rosbags is missing, or the file cannot be written.
     """
     library, path = types.rosbag2(), Path(path)
-    if path.exists():
-        raise StorageError(f"{path} exists; give another name")
     names = [tool.name for tool in scene_of(recording).tools]
     with (
         replaced(path) as whole,

@@ -28,12 +28,12 @@ def certify_range(
     """
     assert vademecum.parametric is not None
     values = _certified_values(vademecum.parametric.coordinates, seed)
-    n_each = -(-n_loads // len(values))  # rounded up
+    ends = np.linspace(0, max(n_loads, len(values)), len(values) + 1).astype(int)
     found = []
-    for k, point in enumerate(values):
+    for k, (point, n_each) in enumerate(zip(values, np.diff(ends).tolist(), strict=True)):
         here = vademecum.at(point)
         found.append(measured(here, problem_at(elasticity, point), n_each, seed + k))
-        progress((k + 1) * n_each)
+        progress(int(ends[k + 1]))
     return certificate_of(vademecum, found, seed)
 
 

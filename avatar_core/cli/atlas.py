@@ -225,6 +225,7 @@ def _sources(
 ) -> list[Source]:
     """Return the named surfaces, and those of a folder in the order of their names."""
     from avatar_core.atlas.growth import SurfaceFile
+    from avatar_core.geometry.label_files import is_label_map
     from avatar_core.geometry.phantom import phantom_liver
     from avatar_core.geometry.surface import METRES, axes_matrix
 
@@ -239,7 +240,10 @@ def _sources(
         if name == "phantom":
             sources.append(phantom_liver())
         else:
-            sources += [SurfaceFile(path, unit, frozen, label) for path in _files(Path(name))]
+            sources += [
+                SurfaceFile(path, unit, frozen, label if is_label_map(path) else None)
+                for path in _files(Path(name))
+            ]
     return sources
 
 

@@ -99,7 +99,7 @@ def calibrate(
     from avatar_core.vademecum.storage import load_vademecum
 
     for one in output or []:
-        require_output(one, _FORMATS, [file, recording], overwrite=overwrite)
+        require_output(one, _FORMATS, [file, recording, *(given or [])], overwrite=overwrite)
     require(0.0 < sensor < 1.0, f"--sensor is {sensor}; give a fraction of the force, e.g. 0.02")
     require(1.0 <= radius <= 20.0, f"--radius is {radius:g} mm; give 1 to 20")
     require(least > 0.0, f"--least is {least} N; give a positive force")

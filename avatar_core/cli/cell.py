@@ -59,7 +59,6 @@ def cell(
     state_dir: Annotated[
         Path | None,
         typer.Option(
-            exists=True,
             file_okay=False,
             help="folder in which nodes keep their state over restarts; default: none is kept",
         ),

@@ -100,7 +100,7 @@ def patient(
     require(neighbors is None or neighbors >= 1, f"--neighbors is {neighbors}; ask for at least 1")
     inputs = (None if surface == "phantom" else surface, atlas, groups)
     require_output(output, [".h5"], inputs, is_vademecum, overwrite)
-    require_timings(timings)
+    require_timings(timings, inputs)
     supports = tuple(SupportOption.parse(text) for text in support or ())
     points = None if groups is None else read_groups(groups)
     clock = StageClock()

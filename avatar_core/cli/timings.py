@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -69,10 +70,10 @@ class StageClock:
         return tuple(StageTime(stage, *spent) for stage, spent in self._spent.items())
 
 
-def require_timings(file: Path | None) -> None:
+def require_timings(file: Path | None, inputs: Iterable[str | Path | None]) -> None:
     """Raise StorageError unless times can be written to the file, if there is one."""
     if file is not None:
-        require_output(file, [".json"], (), measured)
+        require_output(file, [".json"], inputs, measured)
 
 
 def show_timings(clock: StageClock, file: Path | None) -> None:

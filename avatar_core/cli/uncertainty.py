@@ -69,7 +69,7 @@ def uncertainty(
 
     require(20 <= draws <= 1_000_000, f"--draws is {draws}; give 20 to 1,000,000")
     if output is not None:
-        require_output(output, _FORMATS, [file], overwrite=overwrite)
+        require_output(output, _FORMATS, [file, *given], overwrite=overwrite)
     require(1.0 <= radius <= 20.0, f"--radius is {radius:g} mm; give 1 to 20")
     pressed = _depths(depths)
     tip = Tip("sphere", 1e-3 * radius)

@@ -217,7 +217,7 @@ def vademecum(
     require_output(output, [".h5"], inputs, is_vademecum, overwrite)
     coordinates = tuple(Coordinate.parse(text) for text in coordinate or ())
     supports = tuple(SupportOption.parse(text) for text in support or ())
-    require_timings(timings)
+    require_timings(timings, inputs)
     clock = StageClock()
     clock.begin("surface")
     organ, lesion = _read_with_tumour(surface, unit, axes, label, tumour, tumour_label)

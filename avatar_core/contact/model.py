@@ -174,6 +174,7 @@ class ContactData:
     def reset(self) -> None:
         """Return to the organ at rest, without contacts or history. Not real-time safe."""
         restart(self.state, kept=("out", "shown"))
+        self.out.force_error[:] = np.nan
         begin(self.model.arrays, self.state)
 
 

@@ -192,8 +192,8 @@ def require_known(coordinates: Sequence[Coordinate], values: Mapping[str, float]
 
 def remedy(name: str) -> str:
     """Return how to get a coordinate, or the names that there are."""
-    kind = SUPPORT if name.startswith(SUPPORT) else name
-    if kind.rstrip(".") in LIMITS:
+    is_support = name.startswith(SUPPORT) and name != SUPPORT
+    if is_support or (name in LIMITS and name != "support"):
         return f"build it with {option_of(name)}"
     return f"coordinates are {', '.join(LIMITS)}".replace("support", f"{SUPPORT}NAME")
 

@@ -47,7 +47,7 @@ def _unit(parameter: str) -> str:
 def verdict(table: TouchTable, found: Calibration) -> list[str]:
     """Return whether the model fits, and where it does not."""
     told = f"forces differ by {found.rms:.1%} rms; "
-    told += f"a fit so bad comes by chance in {found.probability:.2%} of cases"
+    told += f"a fit so bad comes by chance in {100 * found.probability:.2g} % of cases"
     if found.explained:
         return [f"the fit is good: {told}"]
     lines = [f"NOT EXPLAINED: {told}"]

@@ -32,7 +32,7 @@ from avatar_core.contact.organ_response import closest_weights
 from avatar_core.contact.tip_solver import loads_at_depths
 from avatar_core.fem.elasticity import Material
 from avatar_core.geometry.tip import Tip
-from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.reduction.coordinates import RESECTION, Coordinate
 from avatar_core.tips.kept_factors import factors_of
 from avatar_core.tips.law import LAW_STATE, PATCH_ON_MESH, law_arrays
 from avatar_core.tips.shape_factor import dense
@@ -71,8 +71,10 @@ def log_edges(
     """
     parametric = vademecum.parametric
     young = parametric.young_modulus if parametric else vademecum.material.young_modulus
+    opened = vademecum.resection.opened if vademecum.resection else 0.0
+    every = {RESECTION: Fixed(opened), **known}
     coordinates = parametric.coordinates if parametric else ()
-    constant = {c.name: _constant(c, known, young) for c in coordinates}
+    constant = {c.name: _constant(c, every, young) for c in coordinates}
     free = [c for c in coordinates if constant[c.name] is None]
     grid = MaterialGrid(tuple(free), young, _n_points(len(free)))
     held = {name: value for name, value in constant.items() if value is not None}

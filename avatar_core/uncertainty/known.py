@@ -14,8 +14,9 @@ import numpy as np
 from avatar_core.common.dataclass_json import of_plain, plain
 from avatar_core.common.supports import SUPPORT
 from avatar_core.errors import CoordinateError
-from avatar_core.reduction.coordinates import RESECTION, Coordinate, fixed_support, remedy
+from avatar_core.reduction.coordinates import Coordinate, fixed_support, remedy
 from avatar_core.uncertainty.distributions import Distribution, Fixed, LogUniform, Uniform, within
+from avatar_core.uncertainty.material_grid import uncertain
 
 if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
@@ -49,12 +50,11 @@ class Held:
     def by(vademecum: Vademecum) -> Held:
         """Return the parameters of a vademecum."""
         material, parametric = vademecum.material, vademecum.parametric
-        coordinates = parametric.coordinates if parametric else ()
+        coordinates = uncertain(vademecum)
         own = {
             "young": material.young_modulus,
             "poisson": material.poisson_ratio,
             "contrast": vademecum.contrast or 1.0,
-            RESECTION: vademecum.resection.opened if vademecum.resection else 0.0,
             **{SUPPORT + support.name: support.stiffness for support in vademecum.supports},
         }
         chosen = {c.name for c in coordinates}

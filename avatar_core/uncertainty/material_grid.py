@@ -20,7 +20,7 @@ from itertools import product
 import numpy as np
 
 from avatar_core.common.arrays import FloatArray
-from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.reduction.coordinates import RESECTION, Coordinate
 from avatar_core.vademecum.model import Vademecum
 
 N_POINTS = 5  # for each coordinate
@@ -46,7 +46,7 @@ class MaterialGrid:
         parametric = vademecum.parametric
         if parametric is None:
             return cls((), vademecum.material.young_modulus, 1)
-        coordinates = parametric.coordinates
+        coordinates = uncertain(vademecum)
         n = len(coordinates)
         n_each = N_POINTS if n < 3 else _FEWER.get(n, _LEAST)
         return cls(coordinates, parametric.young_modulus, n_each)
@@ -86,6 +86,12 @@ class MaterialGrid:
             own = lagrange([coordinate.fraction(float(v)) for v in at], self.n_each)
             weights = (weights[:, :, None] * own[:, None, :]).reshape(len(own), -1)
         return weights
+
+
+def uncertain(vademecum: Vademecum) -> tuple[Coordinate, ...]:
+    """Return the coordinates that may be unknown: the opening of a cut is chosen, with kinks."""
+    coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
+    return tuple(c for c in coordinates if c.kind != RESECTION)
 
 
 def chebyshev_points(n: int) -> FloatArray:

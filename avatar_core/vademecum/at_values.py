@@ -59,8 +59,10 @@ def at_values(
     """Return the fields at chosen values; see :meth:`avatar_core.vademecum.model.Vademecum.at`."""
     given = dict(values)
     for name, value in given.items():
-        if not isinstance(value, (int, float, np.number)):
-            raise CoordinateError(f"{name} is {value!r}; give a number")
+        try:
+            given[name] = float(value)
+        except (TypeError, ValueError) as error:
+            raise CoordinateError(f"{name} is {value!r}; give a number") from error
     material = replace(here.material, young_modulus=given.pop("young", here.material.young_modulus))
     coordinates = parametric.coordinates if parametric else ()
     require_known(coordinates, given)

@@ -303,7 +303,7 @@ def _assemble(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> Vade
         contact_near=LocalBlocks(
             mirror.start, mirror.target, mirror.whole(arrays["contact_near/block"])
         ),
-        tip_field=_tip_field(arrays),
+        tip_field=_tip_field(arrays, plain["contrast"]),
         convergence=of_plain(Convergence, plain["convergence"], "convergence"),
         provenance=of_plain(Provenance, plain["provenance"], "provenance"),
         certificate=_certificate(plain["certificate"], plain["accuracy"]),
@@ -333,8 +333,10 @@ def _field(arrays: dict[str, np.ndarray], name: str) -> BlockField:
     return BlockField(*(arrays[f"{name}/{one.name}"] for one in fields(BlockField)))
 
 
-def _tip_field(arrays: dict[str, np.ndarray]) -> TipField:
+def _tip_field(arrays: dict[str, np.ndarray], contrast: Any) -> TipField:
     field = TipField(*(arrays.get(f"tip_field/{name}") for name in TipField._fields))
+    if field.tumour is not None and contrast is None:
+        raise StorageError("the tumour has no 'contrast'; build the file again")
     if OUTLINE_KEYS[0] not in arrays:
         return field
     return field._replace(outline=Outline(*(arrays[key] for key in OUTLINE_KEYS)))

@@ -11,24 +11,30 @@ import pytest
 
 from avatar_core.cli.vademecum import show
 from avatar_core.contact.effects import SelfWeight
+from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.errors import CoordinateError, SceneError, StorageError
 from avatar_core.fem.elasticity import Elasticity, Inclusion
 from avatar_core.fem.norms import relative_l2
 from avatar_core.fem.patch_loads import patch_loads
 from avatar_core.geometry.mesh import Regions
+from avatar_core.geometry.tip import Tip
 from avatar_core.geometry.tumour import volume_fraction_inside
 from avatar_core.pipeline import OrganOptions
 from avatar_core.reduction.coordinates import Coordinate, problem_at
 from avatar_core.scene.file import parse_scene, write_scene
 from avatar_core.scene.model import Scene
 from avatar_core.scene.prepare import scene_spec
-from avatar_core.uncertainty.distributions import Fixed
-from avatar_core.uncertainty.known import known_of
+from avatar_core.uncertainty.distributions import Fixed, Lognormal
+from avatar_core.uncertainty.force_ratios import log_edges
+from avatar_core.uncertainty.force_table import force_table
+from avatar_core.uncertainty.known import known_of, priors_of
 from avatar_core.vademecum.modal_mass import sag_of
 from avatar_core.vademecum.model import Vademecum
 from avatar_core.vademecum.resected import margins, part_volumes
 from avatar_core.vademecum.storage import load_vademecum, save_vademecum
+from tests.helpers.contact import prepare
 from tests.helpers.soft_organ import cut_organ, soft_organ, soft_tumour
+from tests.helpers.tool_motion import press
 
 pytestmark = pytest.mark.long  # it builds an organ
 
@@ -100,10 +106,24 @@ def test_young_modulus_divides_every_displacement_of_an_opened_organ(organ: Vade
     np.testing.assert_allclose(soft.compliance(*where), 2.0 * stiff.compliance(*where), rtol=1e-4)
 
 
-def test_its_opening_is_known_where_the_material_is_not(organ: Vademecum) -> None:
-    young = Fixed(5e3)
-    assert known_of(organ, {"young": young}) == {"young": young, "resection": Fixed(0.0)}
-    assert known_of(organ, {"resection": Fixed(0.5)})["resection"] == Fixed(0.5)
+def test_a_material_is_unknown_at_the_opening_that_was_chosen(organ: Vademecum) -> None:
+    """The force of a table is that of a step, whole and half open."""
+    assert set(priors_of(organ)) == {"young"}
+    with pytest.raises(CoordinateError, match="no 'resection'"):
+        known_of(organ, {"resection": Fixed(0.5)})
+    place, depth, young = middle_of_access(organ), 2e-3, 5e3
+    for opened in (0.0, 0.5):
+        here = organ.at(resection=opened)
+        found = force_table(here, Tip(), [place], [depth, 2 * depth], 0).force(
+            {"young": np.array([young])}
+        )
+        tip = (Tip(),)
+        soft = prepare(here.at(young=young), tip, cloud="off", effects=())
+        surface = here.surface
+        truth = press(soft, tip, surface.centers[[place]], surface.normals[[place]], (depth,))[0]
+        np.testing.assert_allclose(found.ravel()[0], truth, rtol=1e-3)
+        edges = log_edges(here, tip, known_of(here, {"young": Lognormal(young, 1.3)}))
+        assert np.isfinite(edges).all()
 
 
 def test_a_scene_chooses_the_opening(organ: Vademecum) -> None:

@@ -419,8 +419,11 @@ def test_the_command_writes_the_surface_with_its_deviation(
     np.testing.assert_allclose(mesh.points, found.place, atol=1e-9)
     np.testing.assert_allclose(document["targets"][0]["place"], found.targets()[0].place)
     assert document["explained"] and len(document["forces"]) >= 1
-    assert run(monkeypatch, *given, "-o", tmp_path / "out.vtu", "--noise", "1") == 1
-    assert capsys.readouterr().err.count("\n") == 1
+    assert run(monkeypatch, *given, "-o", tmp_path / "out.vtu") == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert run(monkeypatch, *given, "-o", tmp_path / "new.vtu", "--noise", "1") == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "noise" in said
 
 
 def test_the_command_tells_no_place_that_the_model_does_not_explain(

@@ -112,7 +112,7 @@ def test_values_are_those_of_coordinates_that_the_organ_has(chosen: Chosen) -> N
     """The contact node keeps the contrast of the last organ's tumour; this one has none."""
     assert chosen.organ is not None
     there = {"young": 300e3, "contrast": 15.0}
-    chosen.contact = {key: there.get(name, 0.0) for key, name in MATERIAL.items()}
+    chosen.contact = {key: there.get(name, UNSET[key]) for key, name in MATERIAL.items()}
     assert chosen.values(chosen.organ) == {"young": 300e3, "poisson": 0.48}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,7 +53,7 @@ class Parameter:
         """Describe the accepted values, e.g. for an error message."""
         kind = "a number with a decimal point" if isinstance(self.default, float) else "a value"
         bounds = f" from {self.range[0]:g} to {self.range[1]:g}" if self.range else ""
-        quoted = ", in quotes if it is off" if "off" in self.description.split() else ""
+        quoted = ", in quotes if it is off" if re.search(r"\boff\b", self.description) else ""
         return f"{kind}{bounds} like {self.default!r}{quoted}"
 
 

@@ -135,7 +135,7 @@ CONTACT = (
         "material.resection",
         -1.0,
         "opened part of the organ's cut, if it is a coordinate: 0 (whole) to 1 (opened); -1: that "
-        "of the vademecum",
+        "of the scene, or of the vademecum",
         range=(-1.0, 1.0),
         read_only=False,
     ),

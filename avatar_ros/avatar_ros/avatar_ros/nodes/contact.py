@@ -31,7 +31,7 @@ from avatar_core.contact.force_band import ForceBand
 from avatar_core.contact.layout import MODEL
 from avatar_core.errors import AccuracyError, CoordinateError, SceneError, one_line
 from avatar_core.haptics import passivity
-from avatar_core.reduction.coordinates import option_of
+from avatar_core.reduction.coordinates import RESECTION, option_of
 from avatar_core.uncertainty.distributions import Distribution, mappings
 from avatar_core.uncertainty.known import Held
 from avatar_core.vademecum.accuracy import AccuracyCurve
@@ -408,6 +408,8 @@ class ContactNode(ManagedNode):
         """
         if name == "young" and value < _LEAST_YOUNG:
             return f"young is {value:g} Pa; give {_LEAST_YOUNG:g} or more"
+        if name == RESECTION and value < 0.0:
+            return f"resection is {value:g}; give 0 to 1, or -1"
         if self._ranges is None or (name == "young" and name not in self._ranges):
             return ""
         if name not in self._ranges:

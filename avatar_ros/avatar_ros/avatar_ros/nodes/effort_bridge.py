@@ -43,7 +43,7 @@ class EffortBridge(ManagedNode):
         self._commands: Any = None
         self._wrenches: Any = None
         self._timer: Any = None
-        self._heard = 0.0  # time of the last wrench; 0: the effort is 0 already [s]
+        self._heard = 0.0  # time of the last wrench; 0: no more zeros are sent [s]
         super().__init__("effort_bridge", EFFORT_BRIDGE)
 
     def configure(self) -> None:
@@ -76,7 +76,7 @@ class EffortBridge(ManagedNode):
         self._send([force.x, force.y, force.z, torque.x, torque.y, torque.z])
 
     def _watch(self) -> None:
-        """Send no effort for a second after the last wrench: a message may be lost."""
+        """Send zeros for a second once wrenches have ceased: one message may be lost."""
         silent = time.monotonic() - self._heard
         if self._heard and silent > self.get_parameter("timeout").value:
             self._send([])

@@ -249,6 +249,7 @@ class Chosen:
         chosen = read_scene(scene_file(given)) if given else None
         tools = tuple(Tool(*each) for each in zip(self.contact["tools"], tips, strict=True))
         cloud, divisor = self.contact["cloud"], self.contact["cloud_divisor"]
+        material = organ.usable(material)  # the node keeps the values of other organs
         return scene_in_force(chosen, organ.vademecum, material, tools, cloud, divisor)
 
     def send_again(self) -> None:
