@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import meshio
 import nrrd
 import numpy as np
 import pytest
@@ -24,10 +25,12 @@ from avatar_core.cli import main as cli
 from avatar_core.cli.timings import StageClock, require_timings, show_timings
 from avatar_core.cli.vademecum import _read_tumour, _read_with_tumour, read_organ
 from avatar_core.common.processes import ModuleProcess
-from avatar_core.errors import AvatarError, StorageError
+from avatar_core.errors import AvatarError, CoordinateError, StorageError, SurfaceError
 from avatar_core.fem import patch_loads as loads
 from avatar_core.geometry.mesh import tetrahedralize
 from avatar_core.geometry.phantom import phantom_liver
+from avatar_core.geometry.surface import read_surface
+from avatar_core.pipeline import OrganOptions
 from avatar_core.vademecum.storage import load_vademecum
 from tests.core.conftest import Command
 
@@ -451,10 +454,25 @@ def test_reports_pass_through_and_set_the_stage() -> None:
 
 
 def test_a_file_that_cannot_be_written_is_refused_first(tmp_path: Path) -> None:
-    require_timings(None)
+    require_timings(None, ())
     for file in (tmp_path / "times.txt", tmp_path / "missing" / "times.json"):
         with pytest.raises(StorageError, match=r"choose|create"):
-            require_timings(file)
+            require_timings(file, ())
+    plane = tmp_path / "plane.json"
+    plane.touch()
+    with pytest.raises(StorageError, match="is also read"):
+        require_timings(plane, [plane])
+
+
+def test_what_would_be_ignored_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CoordinateError, match="--tumour"):
+        OrganOptions(contrast=4.0)
+    lesion = phantom_liver(12e-3)
+    with pytest.raises(CoordinateError, match=r"give 0\.01 to 100"):
+        OrganOptions(contrast=1e6, tumour=lesion)
+    meshio.write_points_cells(tmp_path / "o.stl", lesion.vertices, {"triangle": lesion.faces})
+    with pytest.raises(SurfaceError, match="has no label 1"):
+        read_surface(tmp_path / "o.stl", "m", label=1)
 
 
 # --- The same file gives the same vademecum -------------------------------------------------------
