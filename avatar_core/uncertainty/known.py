@@ -14,9 +14,8 @@ import numpy as np
 from avatar_core.common.dataclass_json import of_plain, plain
 from avatar_core.common.supports import SUPPORT
 from avatar_core.errors import CoordinateError
-from avatar_core.reduction.coordinates import Coordinate, fixed_support, remedy
+from avatar_core.reduction.coordinates import RESECTION, Coordinate, fixed_support, remedy
 from avatar_core.uncertainty.distributions import Distribution, Fixed, LogUniform, Uniform, within
-from avatar_core.uncertainty.material_grid import uncertain
 
 if TYPE_CHECKING:
     from avatar_core.vademecum.model import Vademecum
@@ -107,6 +106,12 @@ class Held:
         if coordinate.kind != "support":
             return 1.0
         return float(young.ppf(np.array(0.5))) / self.reference
+
+
+def uncertain(vademecum: Vademecum) -> tuple[Coordinate, ...]:
+    """Return the coordinates that may be unknown: the opening of a cut is chosen, with kinks."""
+    coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
+    return tuple(c for c in coordinates if c.kind != RESECTION)
 
 
 def known_of(vademecum: Vademecum, given: Mapping[str, Distribution]) -> dict[str, Distribution]:

@@ -20,7 +20,8 @@ from itertools import product
 import numpy as np
 
 from avatar_core.common.arrays import FloatArray
-from avatar_core.reduction.coordinates import RESECTION, Coordinate
+from avatar_core.reduction.coordinates import Coordinate
+from avatar_core.uncertainty.known import uncertain
 from avatar_core.vademecum.model import Vademecum
 
 N_POINTS = 5  # for each coordinate
@@ -86,12 +87,6 @@ class MaterialGrid:
             own = lagrange([coordinate.fraction(float(v)) for v in at], self.n_each)
             weights = (weights[:, :, None] * own[:, None, :]).reshape(len(own), -1)
         return weights
-
-
-def uncertain(vademecum: Vademecum) -> tuple[Coordinate, ...]:
-    """Return the coordinates that may be unknown: the opening of a cut is chosen, with kinks."""
-    coordinates = vademecum.parametric.coordinates if vademecum.parametric else ()
-    return tuple(c for c in coordinates if c.kind != RESECTION)
 
 
 def chebyshev_points(n: int) -> FloatArray:
