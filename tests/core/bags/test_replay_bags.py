@@ -477,6 +477,8 @@ def test_the_commands(avatar: Command, organ: Vademecum, cell: Cell, tmp_path: P
     made = tmp_path / "made.mcap"
     code, said, _ = avatar("export", tmp_path / "made.h5", "-o", made)
     assert code == 0 and "without 1 clouds" in said
+    assert avatar("export", tmp_path / "made.h5", "-o", made)[0] == 1
+    assert avatar("export", tmp_path / "made.h5", "-o", made, "--overwrite")[0] == 0
     code, said, _ = replay_of(made)
     assert code == 0 and "compared with the computed forces" in said
 

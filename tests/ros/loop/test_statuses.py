@@ -7,6 +7,8 @@ from collections.abc import Iterator
 
 from avatar_core.contact.status import Status
 from avatar_interfaces.msg import ContactState
+from avatar_ros.loop.diagnostics import Faults
+from avatar_ros.loop.settings import CONTACT
 from avatar_ros.loop.statuses import EXPLANATIONS
 from tests.helpers.paths import ROOT
 
@@ -25,6 +27,21 @@ def test_the_message_has_them() -> None:
     assert list(rows("avatar_ros/avatar_interfaces/msg/ContactState.msg", pattern)) == CODES
     for number, name, _ in CODES:  # as generated
         assert getattr(ContactState, f"STATUS_{name}") == number
+
+
+def test_a_past_fault_of_a_device_does_not_quote_what_it_says_now() -> None:
+    fault = {int(Status.NOT_ENABLED): 3}
+    past, present = (
+        Faults(fault, int(status), "DISABLED, homed").text
+        for status in (Status.OK, Status.NOT_ENABLED)
+    )
+    assert "is not enabled" in past and "DISABLED" not in past
+    assert "(it says DISABLED, homed)" in present
+
+
+def test_a_word_that_yaml_reads_as_false_is_asked_for_in_quotes() -> None:
+    hints = {p.name: "in quotes if it is off" in p.wanted() for p in CONTACT}
+    assert {name for name, is_hinted in hints.items() if is_hinted} == {"cloud", "safety.passivity"}
 
 
 def test_the_page_has_them() -> None:

@@ -112,6 +112,8 @@ def test_a_recording_keeps_the_stiffness_in_its_scene(organ: Vademecum) -> None:
         ("support.falciform", 1e5, {}, "--support falciform="),
         ("young", 100.0, {}, "holds 170 to"),
         ("young", 100.0, {BARE: 1e5}, ""),
+        ("young", 0.5, {BARE: 1e5}, "give 1 or more"),
+        ("resection", -0.5, {}, "give 0 to 1, or -1"),
     ],
 )
 def test_a_value_that_the_vademecum_does_not_hold_is_refused(
