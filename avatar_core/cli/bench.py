@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from avatar_core.cli.output import measured, require_output
+from avatar_core.cli.output import require_output
 from avatar_core.cli.progress import build_stages, stage_bar, waiting
 from avatar_core.cli.vademecum import Axes, Label, Unit, Vertices, read_organ, require
 from avatar_core.common.dataclass_json import plain
@@ -237,7 +237,7 @@ def _write(
 def _require_json(output: Path | None, *inputs: str | Path | None) -> None:
     """Raise StorageError, before minutes of work, if the table cannot be written."""
     if output is not None:
-        require_output(output, [".json"], inputs, measured)
+        require_output(output, [".json"], inputs, overwrite=True)
 
 
 def require_ros() -> None:

@@ -22,11 +22,6 @@ Replace = Annotated[bool, typer.Option("--overwrite", help="replace files that a
 PICTURES = (".png", ".pdf", ".svg")
 
 
-def measured(_: Path) -> bool:
-    """Return that a table of times may be replaced, like a picture."""
-    return True
-
-
 def require_output(
     output: Path,
     suffixes: Iterable[str],

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from avatar_core.cli.output import measured, require_output
+from avatar_core.cli.output import require_output
 from avatar_core.common.processes import cpu_seconds
 from avatar_core.errors import StorageError, one_line
 
@@ -73,7 +73,7 @@ class StageClock:
 def require_timings(file: Path | None, inputs: Iterable[str | Path | None]) -> None:
     """Raise StorageError unless times can be written to the file, if there is one."""
     if file is not None:
-        require_output(file, [".json"], inputs, measured)
+        require_output(file, [".json"], inputs, overwrite=True)
 
 
 def show_timings(clock: StageClock, file: Path | None) -> None:

@@ -22,7 +22,8 @@ from avatar_ros.framework.parameters import Parameter, ParameterError
 STATE_DIR = Parameter(
     "state_dir",
     "",
-    "directory where changes made at run time are saved for the next start; empty: none",
+    "directory where changes made at run time are saved for the next start, made if it is not "
+    "there; empty: none",
 )
 
 
@@ -37,7 +38,7 @@ class SavedState:
     Raises
     ------
     ParameterError
-        If the directory is missing or cannot be written to.
+        If the directory cannot be made or written to.
     """
 
     def __init__(self, node: Node, started: dict[str, Any]) -> None:

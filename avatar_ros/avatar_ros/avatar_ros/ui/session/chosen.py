@@ -148,9 +148,8 @@ class Chosen:
     def values(self, organ: Organ) -> dict[str, float]:
         """Return the values of the organ's own coordinates, as built where nothing was chosen [SI].
 
-        A tumour has the contrast of the scene that runs; without one it is as stiff as the organ.
-        The
-        contact node uses no coordinates that the organ does not hold.
+        A contrast that is a coordinate is that of the scene that runs, or 1. The contact node uses
+        no coordinates that the organ does not hold.
         """
         used = organ.usable(self.given)
         return {name: used.get(name, built) for name, (_, _, built) in organ.ranges.items()}

@@ -74,7 +74,7 @@ def material_text(organ: Organ, values: dict[str, float]) -> str:
 
 
 def values_of(scene: Scene) -> dict[str, float]:
-    """Return a scene's values by coordinate [SI]; without its effect, a tumour is as the organ."""
+    """Return a scene's values by coordinate [SI]; without its effect, a contrast is 1."""
     tumours = [effect.contrast for effect in scene.effects if isinstance(effect, Tumour)]
     contrast = tumours[0] if tumours else 1.0
     return scene.values | ({} if contrast is None else {"contrast": contrast})
