@@ -11,6 +11,7 @@ import time
 from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
+from rclpy.duration import Duration
 from std_msgs.msg import Float64MultiArray
 
 from avatar_ros.framework import qos
@@ -18,6 +19,7 @@ from avatar_ros.framework.managed_node import ManagedNode, run
 from avatar_ros.framework.parameters import AUTOSTART, Parameter
 
 _REPEATED = 1.0  # time for which no effort is sent again [s]
+_ARRIVED = Duration(seconds=0.5)  # most time for the last command to arrive
 
 EFFORT_BRIDGE = (
     AUTOSTART,
@@ -64,6 +66,7 @@ class EffortBridge(ManagedNode):
             self.destroy_timer(self._timer)
             self._wrenches = self._timer = None
             self._send([])
+            self._commands.wait_for_all_acked(_ARRIVED)  # else it may end with the node
 
     def clean_up(self) -> None:
         """Remove the publisher."""
