@@ -293,11 +293,14 @@ def stamp_of(message: Any) -> int:
     return int(stamp.sec * 1_000_000_000 + stamp.nanosec)
 
 
-def test_nothing_is_written_over(organ: Vademecum, tmp_path: Path) -> None:
-    file = tmp_path / "made.mcap"
+def test_an_export_that_fails_leaves_the_file_that_was_there(
+    organ: Vademecum, tmp_path: Path
+) -> None:
+    made, file = recorded(organ, ()), tmp_path / "made.mcap"
     file.write_text("mine")
-    with pytest.raises(StorageError, match="exists; give another name"):
-        export(recorded(organ, ()), file)
+    short = replace(made.periods, orientation=made.periods.orientation[:100])
+    with pytest.raises(IndexError):
+        export(replace(made, periods=short), file)
     assert file.read_text() == "mine" and list(tmp_path.iterdir()) == [file]
 
 
