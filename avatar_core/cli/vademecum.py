@@ -335,6 +335,8 @@ def read_organ(
     from avatar_core.geometry.surface import read_surface
 
     if surface == "phantom":
+        require(label is None, "the built-in liver has no labels; leave out --label")
+        require(axes is None, "the built-in liver has its own axes; leave out --axes")
         return phantom_liver()
     organ = read_surface(surface, unit, parsed_axes(axes), label, inside)
     say_notices(organ.notices)

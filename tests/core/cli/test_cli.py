@@ -188,8 +188,8 @@ def test_what_was_read_is_said_before_a_lesion_is_refused(avatar: Command, tmp_p
     values[1:39, 1:39, 1:39], values[45:55, 10:20, 10:20] = 7, 3
     fields = {"space": "RAS", "space directions": 3.0 * np.eye(3), "space origin": [0.0, 0.0, 0.0]}
     nrrd.write(str(tmp_path / "ct.nrrd"), values, fields)
-    chosen = ["--label", "7", "--tumour-label", "3"]
-    code, _, err = avatar("vademecum", tmp_path / "ct.nrrd", *chosen, "-o", tmp_path / "v.h5")
+    chosen = ["--label", "7", "--tumour-label", "3", "-o", tmp_path / "v.h5"]
+    code, _, err = avatar("vademecum", tmp_path / "ct.nrrd", *chosen)
     read, refusal = err.splitlines()
     assert code == 1 and read == "notice: read label 7, 1,482 ml; label 3, 27 ml, inside: 0%"
     assert "0% of the lesion" in refusal
@@ -454,7 +454,6 @@ def test_reports_pass_through_and_set_the_stage() -> None:
 
 
 def test_a_file_that_cannot_be_written_is_refused_first(tmp_path: Path) -> None:
-    require_timings(None, ())
     for file in (tmp_path / "times.txt", tmp_path / "missing" / "times.json"):
         with pytest.raises(StorageError, match=r"choose|create"):
             require_timings(file, ())
@@ -473,6 +472,8 @@ def test_what_would_be_ignored_is_refused(tmp_path: Path) -> None:
     meshio.write_points_cells(tmp_path / "o.stl", lesion.vertices, {"triangle": lesion.faces})
     with pytest.raises(SurfaceError, match="has no label 1"):
         read_surface(tmp_path / "o.stl", "m", label=1)
+    with pytest.raises(AvatarError, match="leave out --label"):
+        read_organ("phantom", "mm", None, "3")
 
 
 # --- The same file gives the same vademecum -------------------------------------------------------
@@ -495,6 +496,5 @@ def test_the_same_surface_gives_the_same_vademecum(livers_dir: Path, tmp_path: P
     assert [process.wait() for process in processes] == [0, 0]
     one, other = map(load_vademecum, built)
     assert one.id == other.id
-    assert one.certificate is not None
-    assert other.certificate is not None
+    assert one.certificate is not None and other.certificate is not None
     assert one.certificate.l2_mean == other.certificate.l2_mean

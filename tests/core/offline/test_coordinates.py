@@ -152,11 +152,13 @@ def test_too_few_modes_are_said_not_to_converge(monkeypatch: pytest.MonkeyPatch)
         n_vertices=400,
         rule=rule,
         coordinates=(Coordinate("poisson", 0.45, 0.48),),
-        n_certified=8,
+        n_certified=11,
     )
     found = build(phantom_liver(12e-3), options)
     assert found.n_modes == 5
     assert not found.convergence.converged
+    assert found.certificate is not None
+    assert found.certificate.n_loads == 11  # divided among eight values
 
 
 def test_at_a_node_the_contact_is_exact_at_the_load_positions(

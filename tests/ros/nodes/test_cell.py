@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -176,18 +177,22 @@ def test_another_cell_in_the_domain_is_an_error_and_its_organ_is_not_taken(
 ) -> None:
     wait_for_model(cell, probe)
 
-    def said(level: bytes) -> str:
-        """Return levels and messages about other cells in the diagnostics."""
-        found: list[DiagnosticStatus] = []
+    rivals = (
+        "/vademecum is published by /probe and /vademecum_loader",
+        "/tool/servo_cf is published by /contact and /probe",
+        "end all but one",
+    )
+
+    def until_diagnosed(level: bytes, texts: Sequence[str] = ()) -> None:
+        """Wait for diagnostics about other cells; names of new nodes come a bit later."""
 
         def is_said(array: DiagnosticArray) -> bool:
-            found[:] = [s for s in array.status if s.name == "/contact: other cells"]
-            return found[0].level == level
+            found = [s for s in array.status if s.name == "/contact: other cells"]
+            return found[0].level == level and all(text in found[0].message for text in texts)
 
         probe.next(DiagnosticArray, "/diagnostics", qos.STATISTICS, is_said, 20.0)
-        return str(found[0].message)
 
-    said(DiagnosticStatus.OK)
+    until_diagnosed(DiagnosticStatus.OK)
     before = probe.next(ContactState, "contact_state", qos.state(1)).vademecum_id
     with closing(Probe()) as second:
         second.node.create_publisher(WrenchStamped, "tool/servo_cf", qos.COMMAND)
@@ -197,12 +202,9 @@ def test_another_cell_in_the_domain_is_an_error_and_its_organ_is_not_taken(
         probe.until(
             lambda: "'twin' refused: /vademecum is published" in cell["contact"].said(), 20.0
         )
-        text = said(DiagnosticStatus.ERROR)
-    for place in (text, cell["contact"].said()):
-        assert "/vademecum is published by /probe and /vademecum_loader" in place
-        assert "/tool/servo_cf is published by /contact and /probe" in place
-        assert "end all but one" in place
-    said(DiagnosticStatus.OK)
+        until_diagnosed(DiagnosticStatus.ERROR, rivals)
+        probe.until(lambda: all(text in cell["contact"].said() for text in rivals), 20.0)
+    until_diagnosed(DiagnosticStatus.OK)
     state = probe.next(ContactState, "contact_state", qos.state(1))
     assert state.vademecum_id == before
 
