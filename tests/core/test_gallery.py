@@ -6,8 +6,8 @@ of the pages anew.
 
 from __future__ import annotations
 
+import hashlib
 import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 import matplotlib.image
 import numpy as np
 import pytest
+from PIL import Image, PngImagePlugin
 
 from tests.helpers.page_code import code_of, run
 from tests.helpers.paths import ROOT
@@ -110,7 +111,14 @@ def test_an_example_computes_and_draws_what_its_page_says(
     assert drawn.stat().st_size < BYTES
     assert np.ptp(matplotlib.image.imread(drawn)) > 0.5  # no blank sheet
     if os.environ.get("AVATAR_DRAW_GALLERY"):
-        shutil.copy(drawn, GALLERY)
+        notes = PngImagePlugin.PngInfo()
+        notes.add_text("code", digest(GALLERY / f"{name}.md"))
+        Image.open(drawn).save(GALLERY / f"{name}.png", pnginfo=notes, optimize=True)
+
+
+def digest(page: Path) -> str:
+    """Return the digest of a page's code, which its picture carries."""
+    return hashlib.sha256(code_of(page).encode()).hexdigest()[:16]
 
 
 def test_every_page_is_short_tried_and_shows_its_picture() -> None:
@@ -119,4 +127,7 @@ def test_every_page_is_short_tried_and_shows_its_picture() -> None:
     for page in pages:
         assert len(code_of(page).splitlines()) <= LINES, page.name
         assert f"]({page.stem}.png)" in page.read_text()
-        assert 5_000 < page.with_suffix(".png").stat().st_size < BYTES
+        picture = page.with_suffix(".png")
+        assert 5_000 < picture.stat().st_size < BYTES
+        with Image.open(picture) as image:
+            assert image.info.get("code") == digest(page), f"draw {picture.name} anew"
