@@ -283,7 +283,7 @@ def hold_or_slip(model, data):  # type: ignore[no-untyped-def]
         if data.grasp.held[t] and data.force[t] > model.grasp.slip[t]:
             let_go(data, t)
             data.grasp.slipped[t] = True
-        if data.grasp.slipped[t]:
+        if data.grasp.slipped[t] and not data.active[t]:  # else it presses
             data.out.status[t] = SLIPPED
 
 

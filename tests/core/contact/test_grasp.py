@@ -216,6 +216,9 @@ def test_it_lets_go_what_is_pulled_too_hard_until_the_jaw_opens() -> None:
         assert np.linalg.norm(data.out.force[0]) <= 0.3
     assert status == Status.SLIPPED and not data.holds(0)
     assert step(data.model, data, at) == Status.SLIPPED  # closed, and back over the organ
+    for depth, status in ((-4e-3, Status.SLIPPED), (2e-3, Status.OK), (-4e-3, Status.SLIPPED)):
+        assert step(data.model, data, at - depth * normal) == status
+        assert data.out.force.any() == (status == Status.OK)
     step(data.model, data, at, None, OPEN)
     step(data.model, data, at, None, SHUT)
     assert data.holds(0)
