@@ -41,7 +41,7 @@ class Status(IntEnum):
     INVALID_POSE = 4, "pose not finite, stamp 0, or not a rotation"
     NOT_CONVERGED = 5, "the contact solve reached its iteration limit"
     TOO_MANY_CONTACTS = 6, "more contacts than the model was prepared for"
-    OUT_OF_RANGE = 7, "outside what the vademecum covers: depth, region or force"
+    OUT_OF_RANGE = 7, "beyond the rim of the accessible surface, or too deep"
     UNKNOWN_FRAME = 8, "pose in another frame than tool_frame: refused, never used"
     EXTRAPOLATED = 9, "pushed or pulled beyond the range of the response: the force goes on"
     LEAP = 10, "the pose leapt farther than a tool can move"
