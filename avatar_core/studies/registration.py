@@ -85,10 +85,10 @@ class RegistrationStudy(Study[RegistrationSettings]):
             f"the mean displacement off ({summary['registration_rigid_error']:.0%} rigidly, "
             f"{summary['registration_splines_error']:.0%} by splines), 90 % intervals hold "
             f"{summary['registration_coverage']:.0%}, in "
-            f"{summary['registration_seconds']:.2f} s. Point forces, a fifth seen: "
-            f"{summary['point_force_error']:.0%}, "
-            f"{summary['point_force_error_zone_known']:.0%} with frame and zone known "
-            f"({summary['point_force_error_full_elements']:.0%} by full elements)"
+            f"{summary['registration_seconds']:.2f} s. Point forces, a fifth of the surface seen: "
+            f"{summary['point_force_error']:.0%}, or {summary['point_force_error_zone_known']:.0%} "
+            f"if frame and zone of the forces are known (full finite elements: "
+            f"{summary['point_force_error_full_elements']:.0%})"
         )
 
     def draw(self, figure: Figure, run: Run[RegistrationSettings]) -> None:
