@@ -238,7 +238,9 @@ def test_a_tip_that_stays_out_of_range_is_a_fault_that_lasts(bench: Any, touch: 
     for _ in range(3):
         found = [cell.step(pose(touch[0] - 30e-3 * touch[1]))[0] for _ in range(10)]
         assert found == [BARRED] * 10
-        assert counter.window()[0].text.startswith("no force: the tool is too deep")
+        assert counter.window()[0].text.startswith(
+            "no force: the tool is off the accessible surface, too deep"
+        )
     for _ in range(2):
         cell.step(pose(touch[0] + 12e-3 * touch[1]))
         said = counter.window()[0].text

@@ -25,7 +25,7 @@ EXPLANATIONS: dict[int, tuple[str, str]] = {
         "lift the tool a little",
     ),
     Status.OUT_OF_RANGE: (
-        "the tool is too deep for the vademecum, or off the accessible surface",
+        "the tool is off the accessible surface, too deep, or was lost inside the organ",
         "lift it off the organ",
     ),
     Status.UNKNOWN_FRAME: (
