@@ -122,11 +122,12 @@ def _solve_period(model, data):  # type: ignore[no-untyped-def]
     _predict(model, data)
     _assemble_incremental(model, data)
     converged = solve_contact(model, data)
+    while hold_or_slip(model, data):  # once for each jaw at most; then without what it pulled
+        converged = solve_contact(model, data)
     if not converged:
         for t in range(data.tip.shape[0]):
             if data.active[t]:
                 data.out.status[t] = NOT_CONVERGED
-    hold_or_slip(model, data)
     superpose_modes(model, data)
     write_forces(model, data)
     advance_history(model, data)

@@ -31,6 +31,7 @@ from avatar_core.common.array_table import array, kind
 from avatar_core.common.jit import fast, inlined
 from avatar_core.common.splines import cell_at, in_cell, on_grid, value_in_cell
 from avatar_core.contact.effects.base import Effect, Ground
+from avatar_core.contact.locate import LEAP
 from avatar_core.contact.organ_response import gather, modes_at_nodes
 from avatar_core.contact.status import BARRED, OUTSIDE, Status
 from avatar_core.errors import SceneError
@@ -120,6 +121,10 @@ def work_jaw(model, data, t):  # type: ignore[no-untyped-def]
             let_go(data, t)
         grasp.shut[t] = grasp.slipped[t] = False
         return False
+    if grasp.held[t] and valid and _has_leapt(grasp.now[t], tip):
+        let_go(data, t)
+        grasp.slipped[t] = True
+        return False
     if grasp.held[t]:
         data.out.status[t] = OK if valid else INVALID_POSE
         if valid:
@@ -137,6 +142,13 @@ def work_jaw(model, data, t):  # type: ignore[no-untyped-def]
             for d in range(3):
                 grasp.start[t, d] = grasp.now[t, d] = tip[d]
     return False
+
+
+@inlined
+def _has_leapt(last, tip):  # type: ignore[no-untyped-def]
+    """Return whether a tip cannot have moved here in a period, e.g. FAR_AWAY."""
+    x, y, z = tip[0] - last[0], tip[1] - last[1], tip[2] - last[2]
+    return x * x + y * y + z * z > LEAP * LEAP
 
 
 @fast
@@ -276,15 +288,17 @@ def stiffness_times(data, t, x0, x1, x2):  # type: ignore[no-untyped-def]
 
 @fast
 def hold_or_slip(model, data):  # type: ignore[no-untyped-def]
-    """Let go of tissue that is pulled harder than its jaw can hold."""
+    """Let go of tissue that is pulled harder than its jaw can hold; return whether one did."""
     if not model.grasp.on:
-        return
+        return False
+    lost = False
     for t in range(data.tip.shape[0]):
         if data.grasp.held[t] and data.force[t] > model.grasp.slip[t]:
             let_go(data, t)
-            data.grasp.slipped[t] = True
+            data.grasp.slipped[t] = lost = True
         if data.grasp.slipped[t] and not data.active[t]:  # else it presses
             data.out.status[t] = SLIPPED
+    return lost
 
 
 @fast

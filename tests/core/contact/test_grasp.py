@@ -7,9 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avatar_core.contact.effects import Effect, Grasp, LargeDeformation, SelfWeight, SeveralTools
+from avatar_core.contact.effects import (
+    Effect,
+    Grasp,
+    Inertia,
+    LargeDeformation,
+    SelfWeight,
+    SeveralTools,
+    Viscoelasticity,
+)
 from avatar_core.contact.effects.grasp import FARTHEST, REACH
-from avatar_core.contact.model import ContactData, Status, model_of, step
+from avatar_core.contact.model import FAR_AWAY, ContactData, Status, model_of, step
 from avatar_core.contact.tool_path import middle_of_access
 from avatar_core.errors import SceneError
 from avatar_core.geometry.tip import Jaw, Tip
@@ -206,6 +214,34 @@ def test_a_tool_beside_presses_into_tissue_that_is_held() -> None:
     free, held = forces
     assert np.linalg.norm(held[1]) > np.linalg.norm(free[1]) > 0.0
     assert not free[0].any() and held[0].any()
+
+
+@pytest.mark.parametrize("effect", [None, Viscoelasticity((0.4,), (0.3,)), Inertia()])
+@pytest.mark.parametrize("there", [np.full(3, FAR_AWAY), -15e-3])
+def test_a_jaw_that_is_torn_off_moves_no_other_tool(
+    effect: Effect | None, there: np.ndarray | float
+) -> None:
+    """The other tool's force is as if the jaw had been opened in that period."""
+    spot = spots()[3]
+    other = min(spots(), key=lambda s: abs(np.linalg.norm(s.center - spot.center) - 20e-3))
+    effects = (Grasp(), SeveralTools(), *([effect] if effect else []))
+    model = model_of(liver(), (jaw_of(slip=4.0), Tip("sphere", RADIUS)), effects=effects)
+    shut, at = np.array([True, False]), np.array([spot.tip(-ABOVE), other.tip(-5e-3)])
+    torn = np.array([spot.tip(there) if isinstance(there, float) else there, other.tip(3e-3)])
+    forces = []
+    for last in (shut, ~shut):  # torn off; opened
+        data = model.data()
+        step(model, data, at, None, np.zeros(2, bool))
+        step(model, data, at, None, shut)
+        for depth in np.linspace(-5e-3, 3e-3, 20):
+            step(model, data, np.array([at[0], other.tip(depth)]), None, shut)
+        assert data.holds(0)
+        forces.append([])
+        for _ in range(30):
+            step(model, data, torn, None, last)
+            forces[-1].append(data.out.force[1].copy())
+    assert np.linalg.norm(forces[1][0]) > 0.1
+    np.testing.assert_allclose(*forces, atol=1e-3 * np.linalg.norm(forces[1][0]))
 
 
 def test_it_lets_go_what_is_pulled_too_hard_until_the_jaw_opens() -> None:
