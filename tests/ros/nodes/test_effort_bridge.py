@@ -37,6 +37,25 @@ def test_a_wrench_arrives_and_ends_with_its_sender(
         assert efforts in heard and all(one in (efforts, [0.0] * axes) for one in heard)
 
 
+def test_it_clears_what_an_earlier_bridge_left_and_passes_on_numbers_only(
+    own_domain: dict[str, str], probe: Any
+) -> None:
+    message = WrenchStamped()
+    message.wrench.force.x, message.wrench.force.y = float("nan"), 1.0
+    heard: list[list[float]] = []
+    probe.node.create_subscription(
+        Float64MultiArray, "commands", lambda one: heard.append(list(one.data)), qos.COMMAND
+    )
+    with running("effort_bridge", own_domain):
+        probe.until(lambda: bool(heard), 20.0)
+        wrenches = probe.node.create_publisher(WrenchStamped, "tool/servo_cf", qos.COMMAND)
+        probe.until(lambda: wrenches.get_subscription_count() > 0, 10.0)
+        for _ in range(20):
+            wrenches.publish(message)
+            probe.spin(0.01)
+    assert len(heard) > 20 and all(one == [0.0] * 3 for one in heard)
+
+
 def test_it_sends_zero_when_it_ends(own_domain: dict[str, str], probe: Any) -> None:
     message = WrenchStamped()
     message.wrench.force.z = 3.0

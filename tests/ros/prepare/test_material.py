@@ -231,10 +231,13 @@ def test_calibrated_values_are_set_all_or_none(
     hand: Hand, own_domain: dict[str, str], probe: Any
 ) -> None:
     code, said = set_by_command(own_domain, "young=5300", "poisson=0.41")
-    assert (code, said) == (0, "set in the contact node: young=5300, poisson=0.41\n")
+    assert (code, said) == (0, "accepted by the contact node: young=5300, poisson=0.41\n")
     assert parameters(probe) == [5300.0, 0.41]
     code, said = set_by_command(own_domain, "young=9900", "poisson=0.495")
     assert code == 1 and "poisson" in said and said.count("\n") == 1
+    assert parameters(probe) == [5300.0, 0.41]
+    code, said = set_by_command(own_domain, "young=9900", "support.dome=1e6")
+    assert code == 1 and "set material.supports of a scene" in said and said.count("\n") == 1
     assert parameters(probe) == [5300.0, 0.41]
 
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from rclpy.parameter import Parameter
 
 from avatar_core.common.supports import ATTACHMENTS
 from avatar_core.scene.file import parse_scene, write_scene
@@ -14,6 +17,7 @@ from avatar_core.scene.prepare import scene_spec
 from avatar_core.vademecum.model import Vademecum
 from avatar_ros.loop.settings import CONTACT, MATERIAL, UNSET, chosen_material
 from avatar_ros.nodes.contact import ContactNode
+from avatar_ros.nodes.contact_parameters import read_contact
 from avatar_ros.prepare.scenes import usable_material
 from avatar_ros.ui.session.presets import HINTS, SLIDERS
 from avatar_ros.ui.session.recorder import scene_in_force
@@ -122,3 +126,42 @@ def test_a_value_that_the_vademecum_does_not_hold_is_refused(
     node = SimpleNamespace(_ranges=organ.ranges)
     said = ContactNode._refusal_of(node, name, value, material)  # type: ignore[arg-type]
     assert said == reason if reason == "" else reason in said
+
+
+@pytest.fixture
+def node(organ: Vademecum) -> Any:
+    """A contact node that has taken its vademecum, without a loop."""
+    default = {p.name: p.default for p in CONTACT}
+    declared = SimpleNamespace(get_parameter=lambda name: SimpleNamespace(value=default[name]))
+    settings = read_contact(declared)  # type: ignore[arg-type]
+    node = SimpleNamespace(
+        _loop=SimpleNamespace(settings=settings, active=SimpleNamespace(shown_modes=None)),
+        _tools=[SimpleNamespace(jaw=SimpleNamespace(thresholds=(0.1, 0.2)))],
+        _values=lambda names, changes: (
+            {name: default[name] for name in names}
+            | {p.name: p.value for p in changes if p.name in names}
+        ),
+        _ranges=organ.ranges,
+        _refusal_of_known=lambda *_: "",
+        _supplier=None,
+    )
+    node._refusal_of = partial(ContactNode._refusal_of, node)  # type: ignore[arg-type]
+    node.change = lambda **values: ContactNode._change(
+        node, [Parameter(name.replace("__", "."), value=value) for name, value in values.items()]
+    )
+    return node
+
+
+def test_young_and_a_stiffness_are_changed_together(node: Any) -> None:
+    """Each is out of range beside the other's value of before: a calibration sets both."""
+    far = {"material__young_modulus": 1e-2 * YOUNG, "support__bare_area": 1e4}
+    assert node.change(**far).successful
+    assert node._loop.settings.material == {"young": 1e-2 * YOUNG, BARE: 1e4}
+
+
+def test_thresholds_of_a_jaw_change_while_it_moves(node: Any) -> None:
+    assert node.change(jaw__closed=0.15).successful
+    assert node._tools[0].jaw.thresholds == node._loop.settings.jaw == (0.15, 0.2)
+    refused = node.change(jaw__closed=0.5)
+    assert not refused.successful and "lies below jaw.closed" in refused.reason
+    assert node._tools[0].jaw.thresholds == (0.15, 0.2)

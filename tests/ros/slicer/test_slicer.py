@@ -153,6 +153,31 @@ def test_a_tool_that_is_moved_there_presses_here(
     probe.next(ContactState, "contact_state", qos.state(1), left, SECONDS)
 
 
+def test_one_tool_of_several_is_told(own_domain: dict[str, str], probe: Any) -> None:
+    """All tools share the topic of states, and the others' may come last."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = int(free.getsockname()[1])
+    publisher = probe.node.create_publisher(ContactState, "contact_state", qos.state(2))
+    said = {"left": ContactState.STATUS_LEAP, "right": ContactState.STATUS_NOT_HOMED}
+
+    def tell() -> None:
+        for tool, status in said.items():
+            publisher.publish(ContactState(tool=tool, status=status))
+
+    with running("slicer_bridge", own_domain, f"port:={port}", "tool:=left"):
+        client = pyigtl.OpenIGTLinkClient("127.0.0.1", port)
+        timer = probe.node.create_timer(2e-3, tell)
+        found = [heard(client, probe, messages.CONTACT).string]
+        for _ in range(60):
+            probe.spin(0.05)
+            message = client.wait_for_message(messages.CONTACT, timeout=0.0)
+            found += [] if message is None else [message.string]
+        client.stop()
+        probe.node.destroy_timer(timer)
+    probe.node.destroy_publisher(publisher)
+    assert len(found) > 10 and all("jumped" in text for text in found)  # of 30
+
+
 def test_a_patient_is_built_by_a_line(probe: Any, slicer: Any) -> None:
     """The line names file and fidelity; stages and outcome come back."""
     goals: list[Any] = []

@@ -43,6 +43,7 @@ from avatar_ros.framework.parameters import ParameterError
 from avatar_ros.framework.saved_state import SavedState
 from avatar_ros.loop.contact_loop import BLEND, ActiveModel, ContactLoop, Publishers
 from avatar_ros.loop.device import ToolDevice, devices
+from avatar_ros.loop.jaw import JAW, chosen_jaw
 from avatar_ros.loop.safety import SAFETY, chosen_safety
 from avatar_ros.loop.settings import (
     CHANGEABLE,
@@ -335,6 +336,7 @@ class ContactNode(ManagedNode):
         try:
             budget = chosen_budget(self._values(_BUDGET, changes))
             safety = chosen_safety(self._values(tuple(p.name for p in SAFETY), changes))
+            jaw = chosen_jaw(self._values(tuple(p.name for p in JAW), changes))
             known = settings.known
             for change in changes:
                 if change.name == "uncertainty":  # the file may have changed
@@ -344,18 +346,13 @@ class ContactNode(ManagedNode):
         refusal = self._refusal_of_known(known, settings.known)
         if refusal:
             return SetParametersResult(successful=False, reason=refusal)
-        material = dict(settings.material)
-        for change in changes:
-            name = MATERIAL.get(change.name)
-            if name is None:
-                continue
-            material.pop(name, None)
-            if change.value == UNSET[change.name]:
-                continue
-            refusal = self._refusal_of(name, change.value, settings.material)
+        wanted = {MATERIAL[p.name]: p for p in changes if p.name in MATERIAL}
+        given = {name: p.value for name, p in wanted.items() if p.value != UNSET[p.name]}
+        material = {k: v for k, v in settings.material.items() if k not in wanted} | given
+        for name, value in given.items():
+            refusal = self._refusal_of(name, value, material)
             if refusal:
                 return SetParametersResult(successful=False, reason=refusal)
-            material[name] = change.value
         try:
             if budget != settings.budget and loop.active.shown_modes is not None:
                 loop.active.shown_modes.keep(budget)
@@ -366,8 +363,17 @@ class ContactNode(ManagedNode):
             self._supplier.ask({"material": material}, self._log_refused_material)
         if known != settings.known and self._supplier is not None:
             self._supplier.ask({"uncertainty": mappings(known)}, self._log_refused_known)
+        for tool in self._tools:
+            if tool.jaw is not None:
+                tool.jaw.thresholds = jaw
         loop.settings = replace(
-            settings, **changed, material=material, budget=budget, known=known, safety=safety
+            settings,
+            **changed,
+            material=material,
+            budget=budget,
+            known=known,
+            safety=safety,
+            jaw=jaw,
         )
         return SetParametersResult(successful=True)
 
@@ -402,9 +408,8 @@ class ContactNode(ManagedNode):
     def _refusal_of(self, name: str, value: float, material: dict[str, float]) -> str:
         """Return why the vademecum in use does not hold a value of the material; else empty.
 
-        With supports, the ranges of stiffness and Young's modulus depend on each other. Where both
-        are
-        changed, the worker process decides.
+        With supports, the ranges of stiffness and Young's modulus depend on each other. Where
+        ``material``, as it will be, has both, the worker process decides.
         """
         if name == "young" and value < _LEAST_YOUNG:
             return f"young is {value:g} Pa; give {_LEAST_YOUNG:g} or more"

@@ -7,6 +7,7 @@ device whose joints are no Cartesian axes needs its Jacobian, which only its dri
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
@@ -53,7 +54,9 @@ class EffortBridge(ManagedNode):
         self._commands = self.create_publisher(Float64MultiArray, "commands", qos.COMMAND)
 
     def activate(self) -> None:
-        """Start to pass on wrenches, and to watch whether they come."""
+        """Clear what an earlier bridge left, pass on wrenches, and watch whether they come."""
+        self._heard = time.monotonic()
+        self._send([])
         self._wrenches = self.create_subscription(
             WrenchStamped, "tool/servo_cf", self._take, qos.NEWEST
         )
@@ -75,8 +78,9 @@ class EffortBridge(ManagedNode):
 
     def _take(self, message: WrenchStamped) -> None:
         force, torque = message.wrench.force, message.wrench.torque
+        efforts = [force.x, force.y, force.z, torque.x, torque.y, torque.z]
         self._heard = time.monotonic()
-        self._send([force.x, force.y, force.z, torque.x, torque.y, torque.z])
+        self._send(efforts if all(map(math.isfinite, efforts)) else [])
 
     def _watch(self) -> None:
         """Send zeros for a second once wrenches have ceased: one message may be lost."""

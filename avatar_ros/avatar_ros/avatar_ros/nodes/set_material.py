@@ -17,13 +17,20 @@ from rclpy.parameter_client import AsyncParameterClient
 from avatar_ros.loop.settings import MATERIAL
 
 _FOUND_WITHIN = 10.0  # time to find the contact node [s]
-_ANSWERED_WITHIN = 60.0  # time for its answer: a material is prepared before it is accepted [s]
+_ANSWERED_WITHIN = 60.0  # time for its answer; the node then prepares the material [s]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Set the given values; return 1 after an error line if no contact node accepts them."""
     given = sys.argv[1:] if arguments is None else arguments
     values = dict(word.split("=", 1) for word in given)
+    if others := sorted(values.keys() - set(MATERIAL.values())):
+        print(
+            f"avatar: no parameter of the contact node is {others[0]}; set material.supports of a "
+            "scene",
+            file=sys.stderr,
+        )
+        return 1
     rclpy.init()
     try:
         node = Node("avatar_calibrate")
@@ -33,12 +40,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if refusal:
         print(f"avatar: {refusal}", file=sys.stderr)
         return 1
-    print(f"set in the contact node: {', '.join(given)}")
+    print(f"accepted by the contact node: {', '.join(given)}")
     return 0
 
 
 def _set(node: Node, values: dict[str, float]) -> str:
-    """Set values by coordinate; return why not, or "" if they are in use."""
+    """Set values by coordinate; return why not, or "" if the node accepted them."""
     names = {coordinate: name for name, coordinate in MATERIAL.items()}
     client = AsyncParameterClient(node, "contact")
     if not client.wait_for_services(_FOUND_WITHIN):

@@ -13,6 +13,7 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from shape_msgs.msg import Mesh
 
+from avatar_core.geometry.tip import MAX_TOOLS
 from avatar_interfaces.msg import ContactState, VademecumInfo
 from avatar_ros.framework import qos
 from avatar_ros.framework.announced import Announced
@@ -79,10 +80,10 @@ class SlicerBridge(ManagedNode):
             Announced(self, Mesh, "rest_surface", self._take_surface),
         ]
         self._own_subscriptions = [
-            self.create_subscription(kind, topic, _never_called, qos.NEWEST, callback_group=polled)
-            for kind, topic in (
-                (PoseStamped, f"{tool}/measured_cp"),
-                (ContactState, "contact_state"),
+            self.create_subscription(kind, topic, _never_called, quality, callback_group=polled)
+            for kind, topic, quality in (
+                (PoseStamped, f"{tool}/measured_cp", qos.NEWEST),
+                (ContactState, "contact_state", qos.state(MAX_TOOLS)),
             )
         ]
         self.get_logger().info(f"3D Slicer may connect to {host}:{port}, in OpenIGTLinkIF")
@@ -158,13 +159,22 @@ class SlicerBridge(ManagedNode):
 
     def _send_tool(self, link: Link) -> None:
         """Send pose and force of the tool."""
-        pose, state = (_newest(subscription) for subscription in self._own_subscriptions)
-        if pose is not None and pose.header.frame_id == self._frame:
+        tool = self.get_parameter("tool").value
+        poses, states = map(_waiting, self._own_subscriptions)
+        pose = poses[-1] if poses else None
+        if pose is not None and pose.header.frame_id != self._frame:
+            self.get_logger().warning(
+                f"poses of {tool} come in {pose.header.frame_id!r}: Slicer does not get them, only "
+                f"poses in {self._frame!r}",
+                once=True,
+            )
+        elif pose is not None:
             p, q = pose.pose.position, pose.pose.orientation
             place = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
             link.send(messages.pose(messages.TOOL, *place))
-        if state is not None and state.tool == self.get_parameter("tool").value:
-            link.send(messages.text(messages.CONTACT, _line_of(state)))
+        own = [state for state in states if state.tool == tool]  # all tools share the topic
+        if own:
+            link.send(messages.text(messages.CONTACT, _line_of(own[-1])))
 
     # --- from the program -------------------------------------------------------------------------
 
@@ -230,11 +240,13 @@ class SlicerBridge(ManagedNode):
             self._link.send(messages.text(messages.BUILD, line))
 
 
-def _newest(subscription: Any) -> Any:
-    """Return the message that waits at a polled subscription, or None."""
+def _waiting(subscription: Any) -> list[Any]:
+    """Return the messages that wait at a polled subscription, oldest first."""
+    found = []
     with subscription.handle:
-        taken = subscription.handle.take_message(subscription.msg_type, False)
-    return None if taken is None else taken[0]
+        while taken := subscription.handle.take_message(subscription.msg_type, False):
+            found.append(taken[0])
+    return found
 
 
 def _line_of(state: ContactState) -> str:
