@@ -53,7 +53,7 @@ _ORIGIN = {
     "Patient": "atlas.patient",
     "PatientOptions": "atlas.patient",
     "Registered": "registration.register",
-    "RegistrationRule": "registration.fit",
+    "RegistrationRule": "registration.rule",
     "ResponseSolver": "atlas.response",
     "Scene": "scene.model",
     "Status": "contact.status",
@@ -129,9 +129,9 @@ if TYPE_CHECKING:
     from avatar_core.reduction.coordinates import Coordinate as Coordinate
     from avatar_core.registration.cloud import Cloud as Cloud
     from avatar_core.registration.cloud import read_cloud as read_cloud
-    from avatar_core.registration.fit import RegistrationRule as RegistrationRule
     from avatar_core.registration.register import Registered as Registered
     from avatar_core.registration.register import register as register
+    from avatar_core.registration.rule import RegistrationRule as RegistrationRule
     from avatar_core.scene.export import export as export
     from avatar_core.scene.file import read_scene as read_scene
     from avatar_core.scene.model import Scene as Scene

@@ -114,7 +114,7 @@ def register(
     4: written, but the unseen part, or a target, is not determined.
     """
     from avatar_core.registration.cloud import read_cloud
-    from avatar_core.registration.fit import RegistrationRule
+    from avatar_core.registration.rule import RegistrationRule
     from avatar_core.registration.register import register as registered_to
     from avatar_core.scene.export import FORMATS
     from avatar_core.scene.surface_export import SURFACE_FORMATS, parts_of

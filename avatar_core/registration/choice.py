@@ -8,15 +8,9 @@ from avatar_core.common.arrays import FloatArray, IntArray, farthest_points
 from avatar_core.errors import RegistrationError
 from avatar_core.geometry.point_location import closest_points
 from avatar_core.registration.cloud import Cloud, require_on_organ, without_background
-from avatar_core.registration.fit import (
-    Alternative,
-    Fit,
-    Problem,
-    RegistrationRule,
-    fit,
-    rigid_motion,
-)
+from avatar_core.registration.fit import Alternative, Fit, Problem, fit, rigid_motion
 from avatar_core.registration.loads import Kind
+from avatar_core.registration.rule import RegistrationRule
 from avatar_core.vademecum.model import Vademecum
 
 KINDS: tuple[Kind, ...] = ("smooth", "few")

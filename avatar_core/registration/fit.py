@@ -18,7 +18,6 @@ import numpy as np
 import scipy.sparse as sp
 
 from avatar_core.common.arrays import FloatArray
-from avatar_core.errors import RegistrationError
 from avatar_core.geometry.point_location import closest_points
 from avatar_core.registration.cloud import Cloud
 from avatar_core.registration.loads import (
@@ -32,7 +31,6 @@ from avatar_core.registration.loads import (
 from avatar_core.registration.posterior import (
     Equations,
     Posterior,
-    Scales,
     Spread,
     at_scales,
     averaged,
@@ -41,88 +39,9 @@ from avatar_core.registration.posterior import (
     likeliest,
 )
 from avatar_core.registration.rigid import RigidMotion
+from avatar_core.registration.rule import RegistrationRule
 from avatar_core.registration.sites import Found, Noise, find_sites
 from avatar_core.vademecum.model import Vademecum
-
-
-@dataclass(frozen=True)
-class RegistrationRule:
-    """Prior knowledge, and limits of the iteration.
-
-    Attributes
-    ----------
-    noise : float
-        Least standard deviation of a point along the normal [m], also for errors of strain and
-        mesh.
-    turn, shift : float
-        Prior root mean squares of the rigid motion, all axes together [rad, m]; near 0 in a known
-        frame.
-    kind : Kind or None
-        Kind of the loads (:mod:`avatar_core.registration.loads`); None for the better of smooth and
-        few.
-    forces : str
-        Places where forces may act, see :func:`avatar_core.registration.loads.allowed_at`.
-    support_shift : float
-        Prior root mean square motion of each support of the vademecum [m]; 0 for none.
-    correlation : float
-        Length over which errors of the points are correlated [m]; 0 for none. Mesh errors always
-        are.
-    within : float
-        Largest half-width of a place's 90 % interval that counts as determined [m].
-    freedom : float
-        Degrees of freedom of Student's distribution, which weights points.
-    tolerance : float
-        Step of a surface point that ends the iteration [m].
-    rigid_steps, most_steps : int
-        Numbers of rigid iterations, and of all iterations at most.
-    rescaled : tuple[int, ...]
-        Steps after the rigid ones at which the scales are sought.
-
-    Examples
-    --------
-    >>> rule = av.RegistrationRule(noise=0.5e-3, turn=0.0, shift=0.0)  # it deformed alone
-    >>> rule.within
-    0.005
-    """
-
-    noise: float = 1e-3
-    turn: float = float(np.radians(10.0))
-    shift: float = 10e-3
-    kind: Kind | None = None
-    forces: str = "accessible"
-    support_shift: float = 0.0
-    correlation: float = 0.0
-    within: float = 5e-3
-    freedom: float = 10.0
-    tolerance: float = 1e-4
-    rigid_steps: int = 8
-    most_steps: int = 40
-    rescaled: tuple[int, ...] = (1, 3, 6)
-
-    def __post_init__(self) -> None:
-        if not 1e-5 <= self.noise <= 0.02:
-            raise RegistrationError(
-                f"a noise of {self.noise:g} m; give the standard deviation of the points in metres "
-                "(1e-3: 1 mm)"
-            )
-        if not (0.0 <= self.shift <= 0.2 and 0.0 <= self.turn <= np.pi):
-            raise RegistrationError(
-                f"a shift of {self.shift:g} m and a turn of {np.degrees(self.turn):g} degrees; "
-                "give up to 0.2 m and 180 degrees"
-            )
-
-    def scales(self, kind: Kind, young_modulus: float) -> Scales:
-        """Return prior scales of loads, length, noise and mismatch."""
-        loads = 0.02 if kind == "few" else 0.02 * young_modulus  # displacement [m], traction [Pa]
-        mismatch = 1.0 if self.correlation else 0.5 if kind == "few" else 0.2  # of the noise
-        middle = np.log([loads, 0.03, self.noise, mismatch * self.noise])
-        return Scales(middle, np.array([0.7 if kind == "few" else 2.0, 0.7, 0.3, 0.7]))
-
-    @property
-    def least_scales(self) -> FloatArray:
-        """Logarithms below which scales are not sought: the stated noise is a lower limit."""
-        alike = np.log(self.noise) if self.correlation else -np.inf
-        return np.array([-np.inf, -np.inf, np.log(self.noise), alike])
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,9 @@ from avatar_core.fem.norms import mean_gradient, mean_strain
 from avatar_core.geometry.point_location import carriers
 from avatar_core.registration.choice import chosen, posed
 from avatar_core.registration.cloud import Cloud
-from avatar_core.registration.fit import Fit, RegistrationRule
+from avatar_core.registration.fit import Fit
 from avatar_core.registration.rigid import RigidMotion
+from avatar_core.registration.rule import RegistrationRule
 from avatar_core.vademecum.model import Vademecum
 
 # The true errors of synthetic clouds over the standard deviations that the posterior gives them:

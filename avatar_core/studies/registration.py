@@ -21,9 +21,10 @@ from avatar_core.geometry.point_location import carriers, closest_points
 from avatar_core.geometry.surface import SurfaceMesh, read_surface
 from avatar_core.pipeline import OrganOptions, build
 from avatar_core.registration.cloud import Cloud
-from avatar_core.registration.fit import RegistrationRule, rigid_motion
+from avatar_core.registration.fit import rigid_motion
 from avatar_core.registration.register import INTERVAL_90, register
 from avatar_core.registration.rigid import RigidMotion
+from avatar_core.registration.rule import RegistrationRule
 from avatar_core.studies.certainty_section import CertaintySettings, Section
 from avatar_core.studies.registration_others import Shown, other_rows, table_of
 from avatar_core.studies.registration_truth import CLASSES, Case, RegistrationSettings, Truth

@@ -22,9 +22,10 @@ from avatar_core.geometry.mesh import tetrahedralize
 from avatar_core.geometry.point_location import carriers
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.pipeline import OrganOptions, build
-from avatar_core.registration.fit import Problem, RegistrationRule, fit, rigid_motion
+from avatar_core.registration.fit import Problem, fit, rigid_motion
 from avatar_core.registration.loads import LoadBasis
 from avatar_core.registration.register import INTERVAL_90, SEEN, cloud_part, register
+from avatar_core.registration.rule import RegistrationRule
 from avatar_core.studies.registration_truth import OTHERS, SOFT, Case, RegistrationSettings, Truth
 from avatar_core.studies.study import Row, follow
 from avatar_core.vademecum.model import Vademecum

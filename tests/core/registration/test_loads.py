@@ -12,10 +12,10 @@ from avatar_core.errors import RegistrationError
 from avatar_core.fem.supports import Support
 from avatar_core.geometry.point_location import carriers
 from avatar_core.registration.cloud import Cloud
-from avatar_core.registration.fit import RegistrationRule
 from avatar_core.registration.loads import PointForces, allowed_at, moved_supports, smooth_loads
 from avatar_core.registration.posterior import cells_of
 from avatar_core.registration.register import register
+from avatar_core.registration.rule import RegistrationRule
 from avatar_core.registration.sites import Noise, find_sites
 from avatar_core.studies.registration_truth import Truth
 from avatar_core.vademecum.model import Vademecum

@@ -20,11 +20,12 @@ from avatar_core.geometry.mesh import tetrahedralize
 from avatar_core.geometry.point_location import carriers
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.registration.cloud import Cloud, read_cloud, require_on_organ
-from avatar_core.registration.fit import Problem, RegistrationRule, rigid_motion
+from avatar_core.registration.fit import Problem, rigid_motion
 from avatar_core.registration.loads import smooth_loads
 from avatar_core.registration.posterior import Scales, averaged, cells_of, equations, posterior
 from avatar_core.registration.register import register
 from avatar_core.registration.rigid import RigidMotion
+from avatar_core.registration.rule import RegistrationRule
 from avatar_core.studies.registration import measured
 from avatar_core.studies.registration_others import POINT, answers, on_small_clamp
 from avatar_core.studies.registration_truth import Case, RegistrationSettings, Truth
@@ -445,8 +446,3 @@ def test_the_command_tells_no_place_that_the_model_does_not_explain(
     assert run(monkeypatch, *given, "--json") == 3
     said, errors = capsys.readouterr()
     assert json.loads(said)["explained"] is False and "NOT EXPLAINED" in errors
-
-
-def test_noise_is_a_length() -> None:
-    with pytest.raises(RegistrationError, match="in metres"):
-        RegistrationRule(noise=1.0)
