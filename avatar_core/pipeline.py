@@ -102,8 +102,9 @@ class OrganOptions:
 
     Raises
     ------
-    ContactError, CoordinateError, MaterialError, MeshError, SurfaceError
-        For options that exclude each other, and for a file that does not exist, before any work.
+    AvatarError
+        For options that exclude each other or lie out of range, and for a file that does not exist,
+        before any work.
 
     Examples
     --------
@@ -156,6 +157,14 @@ class OrganOptions:
             raise CoordinateError(
                 "the contrast is that of a tumour; give its surface with --tumour"
             )
+        for c, value, default in self._outside:
+            if value != default:
+                raise CoordinateError(
+                    f"{c.name} is {value:g}, outside its range {c.low:g} to {c.high:g}; choose "
+                    "one inside, or a wider --coordinate"
+                )
+        if self.seed < 0:
+            raise AvatarError(f"the seed is {self.seed}; give 0 or more")
         low, high = LIMITS["contrast"]
         if not low <= self.contrast <= high:
             raise CoordinateError(f"the contrast is {self.contrast:g}; give {low:g} to {high:g}")
@@ -197,6 +206,25 @@ class OrganOptions:
         supports = (s.coordinate for s in self.supports if s.coordinate)
         cut = (Coordinate(RESECTION, 0.0, 1.0),) if self.resection else ()
         return (*self.coordinates, *supports, *cut)
+
+    @property
+    def _outside(self) -> list[tuple[Coordinate, float, float]]:
+        """Coordinates whose range leaves out the organ's value, with the value and its default."""
+        own = {
+            "poisson": (self.material.poisson_ratio, Material.poisson_ratio),
+            "contrast": (self.contrast, OrganOptions.contrast),
+        }
+        found = [(c, *own[c.name]) for c in self.coordinates]
+        return [one for one in found if not one[0].low <= one[1] <= one[0].high]
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """Defaults that are moved into the ranges of the coordinates, one line each."""
+        return tuple(
+            f"{c.name} is {min(max(value, c.low), c.high):g} until one is chosen: its default "
+            f"{value:g} lies outside {c.low:g} to {c.high:g}"
+            for c, value, _ in self._outside
+        )
 
 
 @repeatable
@@ -441,7 +469,7 @@ def notices_of(surface: SurfaceMesh, options: OrganOptions) -> tuple[str, ...]:
     read = [notice for one in (surface, *tumours) for notice in one.notices]
     turned = orientation_offset(surface, phantom_liver()).warning
     doubts = doubts_of(surface, tumours, options.groups is not None)
-    return (*dict.fromkeys(read), *((turned,) if turned else ()), *doubts)
+    return (*dict.fromkeys(read), *((turned,) if turned else ()), *doubts, *options.notices)
 
 
 def _provenance(surface: SurfaceMesh, options: OrganOptions) -> Provenance:
