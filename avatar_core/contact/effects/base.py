@@ -132,5 +132,5 @@ def require_body(vademecum: Vademecum, effect: str) -> None:
     if vademecum.body is None:
         raise SceneError(
             f"{effect}: the vademecum does not know the organ's mass; build it again with 'avatar "
-            "vademecum SURFACE' and at least 36 modes (patients: --fidelity full)"
+            "vademecum SURFACE' and at least 36 modes (patients: --fidelity solved)"
         )
