@@ -13,6 +13,7 @@ import typer
 
 from avatar_core.cli.output import EXIT_STOPPED, require_output_folder
 from avatar_core.cli.progress import item_bar
+from avatar_core.cli.unused import refuse, refuse_for_phantom
 from avatar_core.cli.vademecum import AsJson, Axes, Label, Unit, parsed_axes, say_notices
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.surface_formats import LABEL_MAP_NAMES, MESH_NAMES, SUFFIXES
@@ -52,6 +53,7 @@ Scheduler = Annotated[
 
 @atlas.command()
 def create(
+    ctx: typer.Context,
     folder: AtlasFolder,
     surfaces: Surfaces,
     unit: Unit = "mm",
@@ -81,6 +83,7 @@ def create(
 
     require_output_folder(folder)
     sources = _sources(surfaces, unit, axes, label)
+    _refuse_unused(ctx, sources)
     options = AtlasOptions(template_vertices, box, spacing)
     grow = partial(create_atlas, folder, sources, options)
     _report(folder, _grown(grow, len(sources), shapes_only, jobs, scheduler))
@@ -88,6 +91,7 @@ def create(
 
 @atlas.command()
 def add(
+    ctx: typer.Context,
     folder: AtlasFolder,
     surfaces: Surfaces,
     unit: Unit = "mm",
@@ -105,6 +109,7 @@ def add(
     from avatar_core.atlas.growth import extend_atlas
 
     sources = _sources(surfaces, unit, axes, label)
+    _refuse_unused(ctx, sources)
     grow = partial(extend_atlas, folder, sources)
     _report(folder, _grown(grow, len(sources), shapes_only, jobs, scheduler))
 
@@ -245,6 +250,18 @@ def _sources(
                 for path in _files(Path(name))
             ]
     return sources
+
+
+def _refuse_unused(ctx: typer.Context, sources: Sequence[Source]) -> None:
+    """Refuse options of files, or of label maps, if there is none among the sources."""
+    from avatar_core.atlas.growth import SurfaceFile
+    from avatar_core.geometry.label_files import is_label_map
+
+    files = [one.path for one in sources if isinstance(one, SurfaceFile)]
+    if not files:
+        refuse_for_phantom(ctx, "phantom")
+    if not any(map(is_label_map, files)):
+        refuse(ctx, ("label",), "for label maps, and none of these files is one")
 
 
 def _files(path: Path) -> list[Path]:

@@ -15,6 +15,7 @@ import typer
 
 from avatar_core.cli.output import require_output
 from avatar_core.cli.progress import build_stages, stage_bar, waiting
+from avatar_core.cli.unused import refuse_for_built, refuse_for_phantom
 from avatar_core.cli.vademecum import Axes, Label, Unit, Vertices, read_organ, require
 from avatar_core.common.dataclass_json import plain
 from avatar_core.errors import AvatarError
@@ -42,6 +43,7 @@ Json = Annotated[
 
 @bench.command("step")
 def bench_step(
+    ctx: typer.Context,
     surface: SurfaceOrVademecum = "phantom",
     unit: Unit = "mm",
     axes: Axes = None,
@@ -68,7 +70,9 @@ def bench_step(
 
     _require_json(output, surface)
     is_built = Path(surface).suffix == ".h5"
-    require(not (is_built and displayed), "--displayed is not for a vademecum: it has its own")
+    if is_built:
+        refuse_for_built(ctx, surface, "unit", "axes", "label", "vertices", "displayed")
+    refuse_for_phantom(ctx, surface)
     shown = [n for n in displayed or (20_000, 100_000) if n != 0]
     for n in shown:
         require_displayable(n)
@@ -92,6 +96,7 @@ def bench_step(
 
 @bench.command("effects")
 def bench_effects(
+    ctx: typer.Context,
     surface: SurfaceOrVademecum = "phantom",
     unit: Unit = "mm",
     axes: Axes = None,
@@ -111,7 +116,11 @@ def bench_effects(
 
     require(modes >= 36, f"--modes is {modes}; inertia and self_weight need at least 36")
     _require_json(output, surface)
-    if Path(surface).suffix == ".h5":
+    is_built = Path(surface).suffix == ".h5"
+    if is_built:
+        refuse_for_built(ctx, surface, "unit", "axes", "label", "vertices", "modes")
+    refuse_for_phantom(ctx, surface)
+    if is_built:
         vademecum = load_vademecum(surface)
     else:
         organ = read_organ(surface, unit, axes, label)
@@ -152,6 +161,7 @@ def _effects_table(rows: list[EffectRow]) -> str:
 
 @bench.command("cell")
 def bench_cell(
+    ctx: typer.Context,
     surface: SurfaceOrVademecum = "phantom",
     seconds: Annotated[float, typer.Option(help="duration of each run [s]")] = 60.0,
     vertices: Vertices = 2850,
@@ -170,10 +180,14 @@ def bench_cell(
     from avatar_core.pipeline import OrganOptions, build
     from avatar_core.vademecum.storage import save_vademecum
 
+    require_seconds(seconds)
+    require(0.0 <= changes <= 1e3, f"--changes is {changes:g} Hz; give 0 to 1000")
+    file = Path(surface)
+    if file.suffix == ".h5":
+        refuse_for_built(ctx, surface, "vertices")
     require_ros()
     _require_json(output, surface)
     with tempfile.TemporaryDirectory(prefix="avatar_bench_") as folder:
-        file = Path(surface)
         if file.suffix != ".h5":
             with stage_bar(build_stages()) as progress:
                 built = build(
@@ -220,6 +234,7 @@ def bench_idle(
 
     Each thread of the nodes is measured while there is nothing to do.
     """
+    require_seconds(seconds)
     require_ros()
     _require_json(output, atlas)
     options = ["--atlas", str(atlas.resolve())] if atlas is not None else []
@@ -238,6 +253,11 @@ def _require_json(output: Path | None, *inputs: str | Path | None) -> None:
     """Raise StorageError, before minutes of work, if the table cannot be written."""
     if output is not None:
         require_output(output, [".json"], inputs, overwrite=True)
+
+
+def require_seconds(seconds: float) -> None:
+    """Raise AvatarError unless a measurement can take as long."""
+    require(1.0 <= seconds <= 1e6, f"--seconds is {seconds:g}; give at least 1")
 
 
 def require_ros() -> None:

@@ -15,6 +15,7 @@ from avatar_core.cli.numbers import ToolTransform, pose_of
 from avatar_core.cli.output import Replace, require_output
 from avatar_core.cli.progress import progress_bar
 from avatar_core.cli.uncertainty import given_of
+from avatar_core.cli.unused import refuse
 from avatar_core.cli.vademecum import File, require, say_notices
 from avatar_core.common.dataclass_json import plain
 
@@ -26,6 +27,7 @@ _FORMATS = (".yaml", ".json", ".png", ".pdf", ".svg")
 
 
 def calibrate(
+    ctx: typer.Context,
     file: File,
     recording: Annotated[
         Path,
@@ -92,12 +94,16 @@ def calibrate(
     The forces are those of some touches. The values are Young's modulus and the coordinates of a
     vademecum.
     """
+    from avatar_core.bags.files import is_bag
     from avatar_core.bags.touched import TouchFile, palpated, read_touched
     from avatar_core.uncertainty.calibration import TouchErrors, calibrated, touch_table
     from avatar_core.uncertainty.calibration_report import say
     from avatar_core.uncertainty.known import priors_of
     from avatar_core.vademecum.storage import load_vademecum
 
+    if not is_bag(recording):
+        use = "for bags, and this is a recording of the page, which holds its tools"
+        refuse(ctx, ("tool_transform", "radius"), use)
     for one in output or []:
         require_output(one, _FORMATS, [file, recording, *(given or [])], overwrite=overwrite)
     require(0.0 < sensor < 1.0, f"--sensor is {sensor}; give a fraction of the force, e.g. 0.02")

@@ -14,15 +14,16 @@ from typing import Annotated
 import typer
 
 from avatar_core.cli.bench import require_ros
+from avatar_core.cli.vademecum import require
 from avatar_core.common.processes import ModuleProcess
 from avatar_core.errors import AvatarError
 
 _AGAIN = 1.0  # after which a cell that has not ended is interrupted again [s]
 
-Host = Annotated[
-    str, typer.Option(help="network address of the page; 0.0.0.0: all interfaces, without TLS")
-]
-Port = Annotated[int, typer.Option(help="port of the page; if it is taken, the next free port")]
+_HOST = "network address of the page; 0.0.0.0: all interfaces, without TLS"
+_PORT = "port of the page; if it is taken, the next free port"
+Host = Annotated[str, typer.Option(help=_HOST)]
+Port = Annotated[int, typer.Option(help=_PORT)]
 
 
 def cell(
@@ -64,8 +65,12 @@ def cell(
         ),
     ] = None,
     ui: Annotated[bool, typer.Option("--ui", help="also serve the planning page")] = False,
-    host: Host = "127.0.0.1",
-    port: Port = 8080,
+    host: Annotated[
+        str | None, typer.Option(help=f"{_HOST}; default: the parameter file's, or 127.0.0.1")
+    ] = None,
+    port: Annotated[
+        int | None, typer.Option(help=f"{_PORT}; default: the parameter file's, or 8080")
+    ] = None,
 ) -> None:
     """Run the nodes of a planning cell.
 
@@ -74,8 +79,11 @@ def cell(
     is started again. A node that refuses to start, or is told to end, ends all. In other respects
     the command equals `ros2 launch avatar_ros planning_cell.launch.py`.
     """
+    require(
+        ui or (host is None and port is None),
+        "--host and --port are for the planning page; add --ui, or leave them out",
+    )
     require_ros()
-    page = {"host": host, "port": str(port)} if ui else {}
     given = {
         "params": params and params.resolve(),
         "library_dir": _library(library_dir, params),
@@ -84,11 +92,12 @@ def cell(
         "tools": tools,
         "scene": Path(scene).resolve() if Path(scene).is_file() else scene,
         "state_dir": state_dir and state_dir.resolve(),
-        **page,
+        "host": host,
+        "port": port,
     }
     command = [sys.executable, "-m", "avatar_ros.nodes.cell"]
     for name, value in given.items():
-        command += [f"--{name}", str(value)] if value else []
+        command += [f"--{name}", str(value)] if value not in (None, "") else []
     if ui:
         require_ui()
         command.append("--ui")

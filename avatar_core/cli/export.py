@@ -10,6 +10,7 @@ import typer
 
 from avatar_core.cli.numbers import numbers
 from avatar_core.cli.output import Replace, require_output
+from avatar_core.cli.unused import refuse
 from avatar_core.cli.vademecum import require
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 
 def export(
+    ctx: typer.Context,
     file: Annotated[
         Path, typer.Argument(help="vademecum, or recording of the planning page (.h5)")
     ],
@@ -73,6 +75,13 @@ def export(
     require(axes in AXES, f"--axes is {axes}; choose {' or '.join(AXES)}")
     suffixes = [*FORMATS, *SURFACE_FORMATS, MCAP]
     require_output(output, suffixes, [file], overwrite=overwrite)
+    if output.suffix == MCAP:
+        use = f"for a vademecum, and {MCAP} is for a recording"
+        refuse(ctx, ("at", "force", "modes", "unit", "axes"), use)
+    elif output.suffix in FORMATS:
+        refuse(ctx, ("unit", "axes"), f"for surfaces, and {output.suffix} is in m and RAS")
+    else:
+        refuse(ctx, ("modes",), f"for {' and '.join(FORMATS)}")
     if output.suffix == MCAP:
         _export_recording(file, output)
         return

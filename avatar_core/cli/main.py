@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from avatar_core.cli.atlas import atlas
-from avatar_core.cli.bench import bench, require_ros, run_cell
+from avatar_core.cli.bench import bench, require_ros, require_seconds, run_cell
 from avatar_core.cli.calibrate import calibrate
 from avatar_core.cli.cell import Host, Port, cell, require_ui, run_page
 from avatar_core.cli.export import export
@@ -21,6 +21,7 @@ from avatar_core.cli.replay import replay
 from avatar_core.cli.scene import scene
 from avatar_core.cli.study import study
 from avatar_core.cli.uncertainty import uncertainty
+from avatar_core.cli.unused import refuse
 from avatar_core.cli.vademecum import Vertices, show, show_text, vademecum
 from avatar_core.errors import AvatarError
 
@@ -75,6 +76,7 @@ def _usage(error: Exception) -> int:
 
 @app.command()
 def demo(
+    ctx: typer.Context,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="file of the picture (.png, .pdf, .svg)")
     ] = Path("avatar_demo.png"),
@@ -105,6 +107,13 @@ def demo(
     from avatar_core.pipeline import OrganOptions, build
     from avatar_core.vademecum.storage import load_vademecum, save_vademecum
 
+    if ui:
+        refuse(ctx, ("output", "cell", "seconds"), "not for --ui, which serves the page instead")
+    else:
+        refuse(ctx, ("host", "port"), "for the planning page (--ui)")
+    if not cell:
+        refuse(ctx, ("seconds",), "for --cell")
+    require_seconds(seconds)
     if cell or ui:
         require_ros()
     if ui:

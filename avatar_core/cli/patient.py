@@ -11,6 +11,7 @@ import typer
 from avatar_core.cli.output import Overwrite, require_output
 from avatar_core.cli.progress import stage_bar
 from avatar_core.cli.timings import StageClock, Timings, require_timings, show_timings
+from avatar_core.cli.unused import refuse_for_phantom
 from avatar_core.cli.vademecum import (
     EXIT_NOT_CONVERGED,
     Axes,
@@ -34,6 +35,7 @@ WEIGHTINGS = ("kriging", "lle-template", "lle-grid", "lle-paper")
 
 
 def patient(
+    ctx: typer.Context,
     surface: Surface,
     atlas: Annotated[Path, typer.Option(help="folder made by 'avatar atlas create'")],
     output: Output,
@@ -98,6 +100,7 @@ def patient(
     require(weighting in WEIGHTINGS, f"--weighting is {weighting}; choose {', '.join(WEIGHTINGS)}")
     require(modes >= 1, f"--modes is {modes}; ask for at least 1")
     require(neighbors is None or neighbors >= 1, f"--neighbors is {neighbors}; ask for at least 1")
+    refuse_for_phantom(ctx, surface)
     inputs = (None if surface == "phantom" else surface, atlas, groups)
     require_output(output, [".h5"], inputs, is_vademecum, overwrite)
     require_timings(timings, inputs)

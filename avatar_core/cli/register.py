@@ -14,6 +14,7 @@ import typer
 
 from avatar_core.cli.numbers import numbers
 from avatar_core.cli.output import Replace, require_output
+from avatar_core.cli.unused import refuse
 from avatar_core.cli.vademecum import AsJson, Axes, File, Unit, parsed_axes, require, say_notices
 from avatar_core.common.dataclass_json import plain
 from avatar_core.geometry.surface_formats import MESH_NAMES
@@ -34,6 +35,7 @@ HELP = (
 
 
 def register(
+    ctx: typer.Context,
     file: File,
     points: Annotated[
         Path,
@@ -114,8 +116,8 @@ def register(
     4: written, but the unseen part, or a target, is not determined.
     """
     from avatar_core.registration.cloud import read_cloud
-    from avatar_core.registration.rule import RegistrationRule
     from avatar_core.registration.register import register as registered_to
+    from avatar_core.registration.rule import RegistrationRule
     from avatar_core.scene.export import FORMATS
     from avatar_core.scene.surface_export import SURFACE_FORMATS, parts_of
     from avatar_core.vademecum.storage import load_vademecum
@@ -125,6 +127,8 @@ def register(
     require(frame in FRAMES, f"--frame is {frame}; choose {' or '.join(FRAMES)}")
     require(kind is None or kind in KINDS, f"--kind is {kind}; choose {', '.join(KINDS)}")
     known = frame == "known"
+    if known:
+        refuse(ctx, ("shift", "turn"), "for --frame camera: in a known frame nothing moves rigidly")
     rule = RegistrationRule(
         noise=noise,
         turn=0.0 if known else math.radians(turn),

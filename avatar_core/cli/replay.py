@@ -10,6 +10,7 @@ import typer
 
 from avatar_core.cli.numbers import ToolTransform, pose_of
 from avatar_core.cli.progress import progress_bar
+from avatar_core.cli.unused import refuse
 from avatar_core.cli.vademecum import require
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ _SAME_CELL = f"give --scene, --tool-transform and --device of the cell, and {_SA
 
 
 def replay(
+    ctx: typer.Context,
     file: Annotated[
         Path,
         typer.Argument(
@@ -77,6 +79,8 @@ def replay(
         how = _How(tool, scene, transform, rate, DEVICES[device])
         _replay_bag(file, vademecum, how, tolerance)
     else:
+        use = "for bags, and this is a recording of the page, which holds its scene"
+        refuse(ctx, ("tool", "scene", "tool_transform", "rate", "device"), use)
         _replay_recording(file, vademecum, tolerance)
 
 

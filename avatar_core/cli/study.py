@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from avatar_core.cli.unused import refuse
 from avatar_core.cli.vademecum import say_notices
 from avatar_core.errors import StorageError
 from avatar_core.studies import NAMES, load_study
@@ -17,6 +18,7 @@ USAGE = 2
 
 
 def study(
+    ctx: typer.Context,
     name: Annotated[str, typer.Argument(help=f"one of {', '.join(NAMES)}")],
     output: Annotated[
         Path, typer.Option("-o", "--output", help="folder to write NAME.json and NAME.png to")
@@ -42,10 +44,12 @@ def study(
     if name not in NAMES:
         print(f"avatar: no study '{name}'; choose one of {', '.join(NAMES)}", file=sys.stderr)
         raise typer.Exit(USAGE)
+    chosen = load_study(name)
+    if not chosen.key:
+        refuse(ctx, ("resume",), f"for studies that keep their rows, and {name} keeps none")
     _require_folder(output)
     if not resume:
         (output / f"{name}.rows.jsonl").unlink(missing_ok=True)
-    chosen = load_study(name)
     start = time.perf_counter()
     run = chosen.conduct(chosen.quick if quick else chosen.full, output, surfaces)
     seconds = time.perf_counter() - start

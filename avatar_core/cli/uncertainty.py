@@ -53,7 +53,7 @@ def uncertainty(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="write numbers (.json) or a picture")
     ] = None,
-    seed: Annotated[int, typer.Option(help="seed of the draws")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the draws")] = 0,
     overwrite: Replace = False,
 ) -> None:
     """Show bands of force and displacement.

@@ -15,6 +15,7 @@ from avatar_core.cli.output import Overwrite, require_output, same_file
 from avatar_core.cli.progress import build_stages, stage_bar
 from avatar_core.cli.show_text import show_text, supported_area
 from avatar_core.cli.timings import StageClock, Timings, require_timings, show_timings
+from avatar_core.cli.unused import refuse, refuse_for_phantom
 from avatar_core.common.dataclass_json import plain
 from avatar_core.errors import AvatarError
 from avatar_core.geometry.surface_formats import LABEL_MAP_NAMES, LABEL_MAPS, MESH_NAMES
@@ -75,6 +76,7 @@ Vertices = Annotated[
 
 
 def vademecum(
+    ctx: typer.Context,
     surface: Surface,
     output: Output,
     unit: Unit = "mm",
@@ -163,7 +165,7 @@ def vademecum(
         ),
     ] = 0,
     seed: Annotated[
-        int, typer.Option(help="random seed of the unseen loads and the contact sites")
+        int, typer.Option(min=0, help="random seed of the unseen loads and the contact sites")
     ] = 0,
     mesh_error: Annotated[
         bool,
@@ -211,6 +213,10 @@ def vademecum(
         material in ("linear", "neo-hookean", "st-venant-kirchhoff"),
         f"--material is {material}; choose linear, neo-hookean or st-venant-kirchhoff",
     )
+    if material == "linear":
+        use = "for large deformation (--material neo-hookean)"
+        refuse(ctx, ("max_push", "pushed"), use)
+    refuse_for_phantom(ctx, surface)
     require(0 < max_push <= 0.05, f"--max-push is {max_push} m; choose up to 0.05 (20e-3: 20 mm)")
     require(pushed >= 0, f"--pushed is {pushed}; ask for 0 or more sites")
     inputs = (None if surface == "phantom" else surface, tumour, groups, resection)
@@ -335,8 +341,6 @@ def read_organ(
     from avatar_core.geometry.surface import read_surface
 
     if surface == "phantom":
-        require(label is None, "the built-in liver has no labels; leave out --label")
-        require(axes is None, "the built-in liver has its own axes; leave out --axes")
         return phantom_liver()
     organ = read_surface(surface, unit, parsed_axes(axes), label, inside)
     say_notices(organ.notices)

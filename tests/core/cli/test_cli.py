@@ -272,29 +272,6 @@ def test_ctrl_c_is_said_and_leaves_nothing(
 # --- Where commands write -------------------------------------------------------------------------
 
 
-BUILDS = (
-    "avatar_core.pipeline.build",
-    "avatar_core.geometry.surface.read_surface",
-    "avatar_core.geometry.tumour.read_tumour",
-    "avatar_core.atlas.storage.load_atlas",
-    "avatar_core.atlas.growth.create_atlas",
-    "avatar_core.scene.export.export",
-    "avatar_core.vademecum.storage.load_vademecum",
-    "avatar_core.studies.bench.step.run_step_bench",
-    "avatar_core.studies.bench.effects.build_for_effects",
-)
-
-
-@pytest.fixture
-def nothing_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def begun(*_: object, **__: object) -> None:
-        raise AvatarError("begun")
-
-    for name in BUILDS:
-        monkeypatch.setattr(name, begun)
-    monkeypatch.setattr(cli, "require_ros", lambda: None)
-
-
 @pytest.fixture
 def said(  # type: ignore[no-untyped-def]
     nothing_is_computed: None, avatar: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -472,8 +449,6 @@ def test_what_would_be_ignored_is_refused(tmp_path: Path) -> None:
     meshio.write_points_cells(tmp_path / "o.stl", lesion.vertices, {"triangle": lesion.faces})
     with pytest.raises(SurfaceError, match="has no label 1"):
         read_surface(tmp_path / "o.stl", "m", label=1)
-    with pytest.raises(AvatarError, match="leave out --label"):
-        read_organ("phantom", "mm", None, "3")
 
 
 # --- The same file gives the same vademecum -------------------------------------------------------
