@@ -95,6 +95,34 @@ def test_a_socket_needs_the_token_too(port):
     assert not is_let_in(port, Cookie="=;not a cookie;")
 
 
+FOREIGN = [  # cookies of other pages of this machine, as browsers send them
+    'prefs={"x":1}',
+    "a=b c",
+    "x",
+    "user@id=3",
+    "name=Zo\u00eb",
+    "=",
+    'quoted="a',
+]
+
+
+@pytest.mark.parametrize("foreign", FOREIGN)
+def test_a_cookie_of_another_page_locks_nobody_out(port, foreign):
+    own = cookie_of(port)
+    for line in (f"{foreign}; {own}", f"{own}; {foreign}", f"avatar_1=another; {foreign};{own}"):
+        assert asked(port, "/", Cookie=line).status == 200
+        assert is_let_in(port, Cookie=line)
+    for wrong in (f"avatar_{port}=another", f"avatar_{port}=\u00eb", f"avatar_1={TOKEN}", "", "="):
+        assert asked(port, "/", Cookie=f"{foreign}; {wrong}").status == 403
+    assert asked(port, "/", Cookie=foreign).status == 403
+
+
+def test_one_of_two_cookies_of_the_name_suffices(port):
+    """A former token may be kept below another path."""
+    assert asked(port, "/", Cookie=f"avatar_{port}=former; {cookie_of(port)}").status == 200
+    assert asked(port, "/", Cookie=f"avatar_{port}=former; avatar_{port}=older").status == 403
+
+
 @pytest.mark.parametrize("origin", [ELSEWHERE, "https://example.org", "null"])
 def test_another_site_is_refused_even_where_the_browser_sends_the_cookie(port, origin):
     assert not is_let_in(port, Cookie=cookie_of(port), Origin=origin)

@@ -17,7 +17,6 @@ import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from http import HTTPStatus
-from http.cookies import CookieError, SimpleCookie
 from io import StringIO
 from ipaddress import ip_address
 from typing import Any
@@ -37,8 +36,7 @@ class Guard:
     """Check of requests to a page that listens on ``host``; it draws a token unless one is given.
 
     A given token stays the same over restarts, and so do bookmarks of the page. ``start`` changes
-    at
-    each start, so that an open tab notices.
+    at each start, so that an open tab notices.
     """
 
     def __init__(self, host: str, token: str = "") -> None:
@@ -58,9 +56,7 @@ class Guard:
             return "this page has another address than the requested one"
         if origin is not None and urlsplit(origin).netloc != host:
             return "the request comes from another site"
-        if not any(
-            hmac.compare_digest(token.encode(), self.token.encode()) for token in _tokens(request)
-        ):
+        if not any(self._is_token(given) for given in _tokens(request)):
             return "open the address that planning_ui printed, which ends in ?token=..."
         return None
 
@@ -68,6 +64,11 @@ class Guard:
         """Make the browser keep the token, for this page alone."""
         name = _cookie(request.headers["Host"])
         response.headers["Set-Cookie"] = f"{name}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+
+    def _is_token(self, given: str) -> bool:
+        """Compare in a time that tells nothing of the token."""
+        as_sent = given.encode(errors="surrogateescape")  # websockets reads bytes so
+        return hmac.compare_digest(as_sent, self.token.encode())
 
     def _is_ours(self, host: str) -> bool:
         try:
@@ -79,16 +80,19 @@ class Guard:
 
 
 def _tokens(request: Request) -> list[str]:
-    """Return the tokens in a request's address and cookie."""
+    """Return the tokens in a request's address and cookies.
+
+    Other pages of this machine set cookies, too, and some of those do not keep to the standard.
+    ``http.cookies`` drops all cookies of a header in which it refuses one.
+    """
     found = parse_qs(urlsplit(request.path).query).get("token", [])
-    cookies: SimpleCookie = SimpleCookie()
-    try:
-        for line in request.headers.get_all("Cookie"):
-            cookies.load(line)
-    except CookieError:  # set by another page of this machine
-        return found
     name = _cookie(request.headers["Host"])
-    return [*found, *([cookies[name].value] if name in cookies else [])]
+    for line in request.headers.get_all("Cookie"):
+        for pair in line.split(";"):
+            key, _, value = pair.partition("=")
+            if key.strip() == name:
+                found.append(value.strip())
+    return found
 
 
 def _cookie(host: str) -> str:
