@@ -19,7 +19,8 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 
 from avatar_core.cli.cell import cell
-from avatar_interfaces.msg import ContactState, LoopStatistics, VademecumFile
+from avatar_interfaces.msg import ContactState, LoopStatistics, VademecumFile, VademecumInfo
+from avatar_interfaces.srv import LoadVademecum
 from avatar_ros.bench.cell import Module
 from avatar_ros.bench.footprint import children
 from avatar_ros.framework import qos
@@ -99,6 +100,44 @@ def test_the_contact_node_is_managed(own_domain: dict[str, str], probe: Any) -> 
             assert _change(probe, "contact", Transition.TRANSITION_CLEANUP)
             assert _state(probe, "contact") == "unconfigured"
             probe.until(lambda: probe.node.count_publishers(topic) == 0, 5.0)
+
+
+@pytest.mark.long  # it builds an organ
+def test_an_inactive_loader_keeps_the_organ_that_was_loaded(
+    own_domain: dict[str, str], library: Path, probe: Any
+) -> None:
+    """Inactive, it keeps the organ of a request; cleaned up, it begins with that of its start."""
+
+    def announced() -> str:
+        """Return the name that a late listener hears."""
+        return str(probe.next(VademecumInfo, "vademecum_info", qos.LATCHED).name)
+
+    values = [f"library_dir:={library}", "vademecum:=liver.h5"]
+    with running("vademecum_loader", own_domain, *values):
+        first = announced()
+        request = LoadVademecum.Request(name="twin.h5")
+        assert probe.call(LoadVademecum, "load_vademecum", request).success
+        assert (announced(), first) == ("twin", "phantom")
+        heard: list[str] = []
+        listener = probe.node.create_subscription(
+            VademecumInfo, "vademecum_info", lambda info: heard.append(info.name), qos.LATCHED
+        )
+        assert _change(probe, "vademecum_loader", Transition.TRANSITION_DEACTIVATE)
+        assert announced() == "twin"
+        assert not probe.call(LoadVademecum, "load_vademecum", request).success
+        assert _change(probe, "vademecum_loader", Transition.TRANSITION_ACTIVATE)
+        assert announced() == "twin"
+        assert set(heard) == {"twin"}
+        assert probe.call(LoadVademecum, "load_vademecum", request).success
+        probe.node.destroy_subscription(listener)
+        for transition in (
+            Transition.TRANSITION_DEACTIVATE,
+            Transition.TRANSITION_CLEANUP,
+            Transition.TRANSITION_CONFIGURE,
+            Transition.TRANSITION_ACTIVATE,
+        ):
+            assert _change(probe, "vademecum_loader", transition)
+        assert announced() == first
 
 
 WRONG = [

@@ -108,9 +108,10 @@ class LoaderNode(ManagedNode):
         }
 
     def activate(self) -> None:
-        """Load the first vademecum and accept requests."""
+        """Load the first vademecum, unless one is announced already, and accept requests."""
         assert self._settings is not None
-        self._load_first(self._settings.vademecum)
+        if not self._loaded:  # the topics keep the announced one while the node is inactive
+            self._load_first(self._settings.vademecum)
         return_memory()
         self._is_active = True
 
@@ -127,7 +128,7 @@ class LoaderNode(ManagedNode):
         self._reader = self._calibrator = None
         for publisher in self._outlets.values():
             self.destroy_publisher(publisher)
-        self._outlets = {}
+        self._outlets, self._loaded = {}, ""
 
     @property
     def has_pending_answers(self) -> bool:
