@@ -21,6 +21,7 @@ from avatar_core.contact import step as kernels
 from avatar_core.contact.data import DATA, RESUMED, at_rest, begin
 from avatar_core.contact.effects import Effect
 from avatar_core.contact.layout import MODEL, PERIOD, lay_out
+from avatar_core.contact.status import BARRED
 from avatar_core.contact.status import FAR_AWAY as FAR_AWAY
 from avatar_core.contact.status import Status as Status
 from avatar_core.geometry.tip import Tip
@@ -164,12 +165,31 @@ class ContactData:
         if mine.friction is not None and theirs.friction is not None:
             for name in ("anchor", "motion", "push"):
                 getattr(mine.friction, name)[:] = getattr(theirs.friction, name)
-        if mine.grasp is not None and theirs.grasp is not None:
-            for name in ("held", "begun", "shut", "slipped", "place", "start", "now"):
-                getattr(mine.grasp, name)[:] = getattr(theirs.grasp, name)
-            mine.grasp.fresh[:] = mine.grasp.held
+        if theirs.grasp is not None:
+            for tool in range(self.model.n_tools):
+                self._resume_jaw(before, tool)
         if mine.respiration is not None and theirs.respiration is not None:
             mine.respiration.clock[:] = theirs.respiration.clock
+
+    def _resume_jaw(self, before: ContactData, tool: int) -> None:
+        """Take over what a jaw holds; without a jaw here, as if it had been opened."""
+        mine, theirs = self.state, before.state
+        if mine.grasp is not None and self.model.arrays.grasp.radius[tool] > 0.0:
+            for name in ("held", "begun", "shut", "slipped", "place", "start", "now"):
+                getattr(mine.grasp, name)[tool] = getattr(theirs.grasp, name)[tool]
+            mine.grasp.fresh[tool] = mine.grasp.held[tool]
+        elif before.holds(tool):
+            mine.passage[tool], mine.active[tool], mine.force[tool] = BARRED, False, 0.0
+            if mine.friction is not None:
+                mine.friction.push[tool] = 0.0
+
+    def note_shut(self, jaws: np.ndarray) -> None:
+        """Note which jaws, shape (n_tools,), are closed already: they hold nothing new.
+
+        Real-time safe.
+        """
+        if self.state.grasp is not None:
+            self.state.grasp.shut[:] = jaws
 
     def reset(self) -> None:
         """Return to the organ at rest, without contacts or history. Not real-time safe."""

@@ -66,9 +66,6 @@ PLACED = tuple(
         Status.OUT_OF_RANGE,
         Status.EXTRAPOLATED,
         Status.ENGAGING,
-        Status.NO_OPERATING_STATE,
-        Status.NOT_ENABLED,
-        Status.NOT_HOMED,
         Status.SLIPPED,
     )
 )

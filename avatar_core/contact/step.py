@@ -216,7 +216,6 @@ def write_forces(model, data):  # type: ignore[no-untyped-def]
             write_held_force(model, data, t, n)
             if is_held_too_far(model, data, t) and out.status[t] == OK:
                 out.status[t] = EXTRAPOLATED
-            add_torque(model, data, t)
             n += 1
             continue
         if data.force[t] <= 0.0:

@@ -13,7 +13,7 @@ independent of S and to its end, even if poses are valid again in the meantime. 
 costs at least RAMP, SETTLING and ENGAGEMENT, and no force returns at once. In ordinary use F = f,
 bit by bit: sliding and pressing reach neither limit.
 
-Torque is scaled like its force.
+Torque is scaled like its force. It changes no faster than the torque of a force at ``LEVER``.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from avatar_core.errors import ContactError
 SETTLING = 50e-3  # time time of valid poses before the force returns [s]
 ENGAGEMENT = 100e-3  # from no force to all of it [s]
 RAMP = 8e-3  # from a force to none; within 10 ms even if a period is late [s]
+LEVER = 20e-3  # radius of the largest tip: a torque may change by S LEVER a second [m]
 _LONGEST = 2e-3  # period for the slew limit, at most [s]
 
 
@@ -88,7 +89,9 @@ class ForceGuard:
         """Whether nothing is sent. Real-time safe."""
         return not any(self._sent)
 
-    def update(self, now: float, sound: bool, force: FloatArray, torque: FloatArray) -> None:
+    def update(
+        self, now: float, sound: bool, force: FloatArray, torque: FloatArray, share: float = 1.0
+    ) -> None:
         """Turn the organ's force and torque, shape (3,), into those to send, in place.
 
         Real-time safe: neither raises nor blocks. A force that is not finite is a fault.
@@ -103,11 +106,14 @@ class ForceGuard:
             Force [N].
         torque : ndarray, shape (3,)
             Torque [N m].
+        share : float
+            This force over the computed one, which other limits reduced.
         """
         period, self._last = min(max(now - self._last, 0.0), _LONGEST), now
         x, y, z = float(force[0]), float(force[1]), float(force[2])
         size = math.hypot(x, y, z)
-        if not (sound and math.isfinite(size)):
+        turn = math.hypot(float(torque[0]), float(torque[1]), float(torque[2]))
+        if not (sound and math.isfinite(size + turn)):
             self._fail(now)
         elif math.isinf(self._sound):
             self._sound = now
@@ -119,7 +125,8 @@ class ForceGuard:
         sent = self._sent
         force[0], force[1], force[2] = sent[0], sent[1], sent[2]
         torque[0], torque[1], torque[2] = sent[3], sent[4], sent[5]
-        self.sent_fraction = math.hypot(*sent[:3]) / size if 0.0 < size < math.inf else 1.0
+        sent_of_this = math.hypot(*sent[:3]) / size if 0.0 < size < math.inf else 1.0
+        self.sent_fraction = share * sent_of_this
 
     def _fail(self, now: float) -> None:
         """Start the ramp, unless the ramp of an earlier fault is under way."""
@@ -141,24 +148,16 @@ class ForceGuard:
         torque: FloatArray,
         period: float,
     ) -> None:
-        """Approach the limited force as fast as the slew rate allows."""
+        """Approach the limited force, and the torque, as fast as the slew rate allows."""
         largest = self.limits.force
         if size > largest:
             gain *= largest / size
-        x, y, z = (gain * value for value in force)
+        wanted = [gain * float(value) for value in (*force, *torque)]
         last = self._sent
-        change = math.hypot(x - last[0], y - last[1], z - last[2])
+        change = max(math.dist(wanted[:3], last[:3]), math.dist(wanted[3:], last[3:]) / LEVER)
         step = self.limits.slew * period
-        part = 1.0
-        if change > step:
-            part = step / change
-            x, y, z = (
-                old + part * (new - old) for old, new in zip(last[:3], (x, y, z), strict=True)
-            )
+        part = step / change if change > step else 1.0
         self.limited = size > largest or part < 1.0
-        a, b, c = (gain * float(value) for value in torque)
         if part < 1.0:
-            a, b, c = (
-                old + part * (new - old) for old, new in zip(last[3:], (a, b, c), strict=True)
-            )
-        self._sent = [x, y, z, a, b, c]
+            wanted = [old + part * (new - old) for old, new in zip(last, wanted, strict=True)]
+        self._sent = wanted

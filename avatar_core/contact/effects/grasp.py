@@ -303,14 +303,19 @@ def hold_or_slip(model, data):  # type: ignore[no-untyped-def]
 
 @fast
 def write_held_force(model, data, t, n):  # type: ignore[no-untyped-def]
-    """Write the force on a tool that holds tissue, and its contact, number n."""
+    """Write force and torque on a tool that holds tissue, and its contact, number n."""
     out, g, y = data.out, data.friction.push[t], data.friction.offset[t]
+    at, force, torque, tip = out.contact_position[n], out.force[t], out.torque[t], data.tip[t]
+    known = out.status[t] != INVALID_POSE
     for d in range(3):
-        out.contact_position[n, d] = data.point[t, d] + y[d]
+        at[d] = data.point[t, d] + y[d]
         out.contact_normal[n, d] = data.normal[t, d]
-        if out.status[t] != INVALID_POSE:
-            out.force[t, d] = -g[d]
-        out.contact_force[n, d] = out.force[t, d]
+        force[d] = -g[d] if known else 0.0
+        out.contact_force[n, d] = force[d]
+    for i in range(3):  # (contact - pose) x F
+        j, k = (i + 1) % 3, (i + 2) % 3
+        if known:
+            torque[i] = (at[j] - tip[j]) * force[k] - (at[k] - tip[k]) * force[j]
     out.contact_penetration[n] = 0.0
 
 

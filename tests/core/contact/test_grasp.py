@@ -357,6 +357,45 @@ def test_another_model_of_the_organ_goes_on_holding() -> None:
     np.testing.assert_allclose(other.out.force, force, rtol=1e-9)
 
 
+def test_a_scene_without_its_jaw_lets_go_as_an_open_one(  # while another tool keeps a jaw
+) -> None:
+    spot, effects = middle(), (Grasp(), SeveralTools())
+    bare, far = Tip("sphere", RADIUS), np.full(3, FAR_AWAY)
+    data = model_of(liver(), (jaw_of(), jaw_of()), effects=effects).data()
+    deep = np.array([spot.tip(4e-3), far])
+    step(data.model, data, deep, None, np.zeros(2, bool))
+    step(data.model, data, deep, None, np.array([True, False]))
+    assert data.holds(0)
+    for tips, chosen in (((bare, jaw_of()), effects), ((bare, bare), (SeveralTools(),))):
+        other = model_of(liver(), tips, effects=chosen).data()
+        other.resume(data)
+        for depth, presses in ((4e-3, False), (-4e-3, False), (2e-3, True)):
+            step(other.model, other, np.array([spot.tip(depth), far]), None, np.ones(2, bool))
+            assert np.isfinite(other.out.force).all() and not other.holds(0)
+            assert other.out.force[0].any() == presses
+
+
+def test_a_jaw_that_is_closed_already_grips_nothing() -> None:
+    data = model_of(liver(), (jaw_of(),), effects=(Grasp(),)).data()
+    data.note_shut(SHUT)
+    step(data.model, data, middle().tip(-ABOVE)[None], None, SHUT)
+    assert not data.holds(0)
+
+
+@pytest.mark.parametrize("depth", [-1e-3, 0.0, 4e-3])
+def test_the_torque_of_what_is_held_is_that_of_its_contact(depth: float) -> None:
+    data = model_of(liver(), (jaw_of(),), effects=(Grasp(),)).data()
+    at = middle().tip(depth)[None]
+    step(data.model, data, at, None, OPEN)
+    step(data.model, data, at, None, SHUT)
+    tip = at + np.array([[1e-3, 2e-3, 1e-3]])
+    step(data.model, data, tip)
+    lever = data.out.contact_position[0] - tip[0]
+    expected = np.cross(lever, data.out.force[0])
+    assert np.linalg.norm(data.out.force[0]) > 0.1
+    np.testing.assert_allclose(data.out.torque[0], expected, atol=1e-12)
+
+
 def test_a_tool_that_holds_nothing_presses_as_without_a_jaw() -> None:
     bare = model_of(liver(), (Tip("sphere", RADIUS),), effects=()).data()
     jaw = model_of(liver(), (jaw_of(),), effects=(Grasp(),)).data()

@@ -13,6 +13,7 @@ from avatar_core.errors import ContactError
 from avatar_core.haptics.force_guard import (
     DEVICES,
     ENGAGEMENT,
+    LEVER,
     RAMP,
     SETTLING,
     ForceGuard,
@@ -52,6 +53,34 @@ def test_ordinary_forces_go_through_to_the_bit() -> None:
         force = 7.5 * (1.0 - math.cos(2 * math.pi * 5 * k * PERIOD)) * np.array([0.6, 0.0, 0.8])
         np.testing.assert_array_equal(drive.step(force)[:3], force)
         assert not drive.guard.limited and drive.guard.sent_fraction == 1.0
+
+
+def test_a_torque_that_leaps_follows_at_the_slew_rate() -> None:
+    """At most the torque that a force at the largest tip's radius could change by."""
+    guard, force, torque = ForceGuard(LIMITS), np.zeros(3), np.zeros(3)
+    for k in range(300):
+        force[:], torque[:] = (1.0, 0.0, 0.0), (0.0, 0.2, 0.0)
+        guard.update(k * PERIOD, True, force, torque)
+    assert torque[1] == 0.2
+    sent = []
+    for k in range(300, 330):
+        force[:], torque[:] = (1.0, 0.0, 0.0), (0.0, -0.2, 0.0)
+        guard.update(k * PERIOD, True, force, torque)
+        sent.append(torque[1])
+        assert force[0] == 1.0
+    steps = -np.diff([0.2, *sent])
+    assert steps.max() <= LIMITS.slew * PERIOD * LEVER * (1.0 + 1e-9) and sent[-1] == -0.2
+
+
+def test_the_sent_part_counts_what_other_limits_took() -> None:
+    guard, force, torque = ForceGuard(LIMITS), np.zeros(3), np.zeros(3)
+    for k in range(300):
+        force[:] = 1.0, 0.0, 0.0
+        guard.update(k * PERIOD, True, force, torque, 0.25)
+    assert guard.sent_fraction == 0.25
+    torque[:] = np.nan
+    guard.update(300 * PERIOD, True, force, torque)
+    assert np.isfinite(torque).all()
 
 
 def test_a_force_that_is_too_large_keeps_its_direction() -> None:

@@ -14,6 +14,6 @@ class UnlimitedGuard:
         self.limits, self.sent_fraction, self.limited = DEVICES["sigma"], 1.0, False
         self.engaged = self.silent = True
 
-    def update(self, now: float, sound: bool, force: Any, torque: Any) -> None:
+    def update(self, now: float, sound: bool, force: Any, torque: Any, share: float = 1.0) -> None:
         if not sound:
             force[:] = torque[:] = 0.0

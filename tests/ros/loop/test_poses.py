@@ -229,6 +229,22 @@ def test_a_stream_is_judged_by_when_it_comes(bench: Any, touch: Any, hertz: int,
     assert again[-1][1].any()
 
 
+def test_a_tool_whose_device_is_not_ready_enters_no_organ(bench: Any, touch: Any) -> None:
+    """A hand moves it there without resistance: once ready, it has no force before it came out."""
+    cell = bench()
+    cell.tools[0].device = ContactState.STATUS_NOT_ENABLED
+    for d in np.arange(-6e-3, 20e-3, 1e-3):
+        status, force = cell.step(pose(touch[0] - d * touch[1]))
+        assert status == ContactState.STATUS_NOT_ENABLED and not force.any()
+    cell.tools[0].device = OK
+    for _ in range(300):
+        status, force = cell.step(pose(touch[0] - 20e-3 * touch[1]))
+        assert status == BARRED and not force.any()
+    cell.step(pose(touch[0] + 20e-3 * touch[1]))
+    tip = cell.press(touch, 1e-3)
+    assert cell.step(pose(tip))[1].any()
+
+
 def test_a_tip_that_stays_out_of_range_is_a_fault_that_lasts(bench: Any, touch: Any) -> None:
     """It lasts until the tip has left the organ; its poses are valid all the time."""
     cell = bench()

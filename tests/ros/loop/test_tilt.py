@@ -14,6 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from avatar_core.contact.effects import Tilt
 from avatar_core.geometry.tip import Tip
+from avatar_core.haptics.force_guard import DEVICES, ForceGuard
+from avatar_interfaces.msg import ContactState
 from avatar_ros.framework.templates import rotated
 from avatar_ros.loop.contact_loop import ActiveModel
 from avatar_ros.loop.safety import Safety
@@ -85,6 +87,23 @@ def test_a_pose_that_is_refused_lets_the_torque_fade(
         made.step(pose(surface - 3e-3 * normal, quaternion=np.full(4, np.nan)))
     assert not made.loop.active.data.state.axis.any()
     assert np.isfinite(torque(made)).all()
+
+
+def test_a_leap_is_no_lever(bench: Any, organ: Any, touch: tuple[np.ndarray, np.ndarray]) -> None:
+    """A torque about the origin of the tool's frame keeps the last pose that was used."""
+    made: SteppedLoop = bench(20e-3)
+    made.tools[0] = ToolChannel(made.poses[0], made.poses[0], "organ", Safety(wrench="spatial"))
+    made.loop._tools = made.tools
+    made.loop.settings = replace(made.settings, safety=Safety(wrench="spatial"))
+    made.loop.guards = [ForceGuard(DEVICES["sigma"])]
+    tip = touch[0]
+    for depth in [*np.arange(-6e-3, 0.0, 0.5e-3), *np.zeros(200)]:
+        made.step(pose(touch[0] - depth * touch[1]))
+    before = torque(made)
+    assert np.linalg.norm(before) > 1e-3
+    status, force = made.step(pose(tip + np.array([50.0, 0.0, 0.0])))
+    assert status == ContactState.STATUS_LEAP and np.linalg.norm(force) > 0.1
+    assert np.linalg.norm(torque(made)) <= np.linalg.norm(before)
 
 
 def test_a_vector_turns_as_scipys() -> None:

@@ -18,6 +18,7 @@ back gradually. Stopping the loop counts as a fault.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from contextlib import ExitStack, suppress
@@ -279,6 +280,9 @@ class ContactLoop:
         Real-time safe.
         """
         outgoing = self._used.data
+        if active.data is not None and active.data.grasps:  # a jaw that is closed already holds
+            self._take_jaws()  # nothing of another organ
+            active.data.note_shut(self._jaws)
         if outgoing is not None:
             self._blend = 0.0
             if active.id == self._used.id:
@@ -335,12 +339,20 @@ class ContactLoop:
             wrench = tool.wrench
             wrench.force[:] = self._forces[i]
             wrench.torque[:] = 0.0 if data is None else data.out.torque[i]
+            share = 1.0 if energies is None or data is None else self._share(i, data)
+            wrench.torque *= share
             guard.limits = limits
-            guard.update(now, tool.fault == OK and not self._stopping, wrench.force, wrench.torque)
+            sound = tool.fault == OK and not self._stopping
+            guard.update(now, sound, wrench.force, wrench.torque, share)
             if energies is not None:
                 energies.held[i, -1] = wrench.force
             if data is not None or tool.connected:
                 tool.answer()
+
+    def _share(self, i: int, data: Any) -> float:
+        """Return the part of a tool's force that passivity leaves, at most 1. Real-time safe."""
+        computed = math.hypot(*data.out.force[i])
+        return min(math.hypot(*self._forces[i]) / computed, 1.0) if computed > 0.0 else 1.0
 
     def _send_zero(self) -> None:
         """Send a last wrench of zero to every tool, after a failure."""

@@ -121,7 +121,8 @@ class ToolChannel:
         self._replaced: set[str] = set()  # publishers whose stream had ended when another began
         self._several = False  # whether there are several publishers, replaced ones apart
         self._kind = safety.wrench
-        # orientation of the last valid pose, kept while the channel exists
+        # position and orientation of the last pose that was used, kept while the channel exists
+        self._reference = np.zeros(3)
         self._axes = (0.0, 0.0, 0.0, 1.0)
 
     @property
@@ -150,6 +151,8 @@ class ToolChannel:
     ) -> bool:
         """Take the newest pose, if any; return true if a usable one came. Real-time safe.
 
+        A tool whose device allows no force is far away.
+
         Parameters
         ----------
         now, timeout : int
@@ -171,6 +174,10 @@ class ToolChannel:
             held = status == INVALID_POSE and now - self._received <= timeout
             tip[:] = _UNKNOWN if held else FAR_AWAY
             return False
+        if self.device != OK:  # a hand moves it without resistance: it touches nothing
+            orientation[:] = 0.0
+            tip[:] = FAR_AWAY
+            return taken is not None
         if taken is None:
             return False
         self._place(tip, orientation)
@@ -234,7 +241,7 @@ class ToolChannel:
             for part in (force, torque):
                 part[:] = rotated((part[0], part[1], part[2]), (-i, -j, -k, w))
         elif self._kind == "spatial" and self.stamp != NO_STAMP:
-            x, y, z = self._last
+            x, y, z = self._reference
             torque[0] += y * force[2] - z * force[1]
             torque[1] += z * force[0] - x * force[2]
             torque[2] += x * force[1] - y * force[0]
@@ -294,7 +301,7 @@ class ToolChannel:
 
     def _place(self, tip: np.ndarray, orientation: np.ndarray) -> None:
         """Transform the last pose into the organ's frame. Real-time safe."""
-        tip[:] = self._last
+        tip[:] = self._reference[:] = self._last
         self._axes = self._reader.orientation
         orientation[:] = self._axes
         if self._is_turned:
