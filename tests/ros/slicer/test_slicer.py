@@ -6,7 +6,8 @@ import socket
 import struct
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from sensor_msgs.msg import PointCloud2
 
 from avatar_interfaces.action import BuildPatient
 from avatar_interfaces.msg import ContactState
+from avatar_interfaces.srv import LoadVademecum
 from avatar_ros.bench.cell import Module
 from avatar_ros.framework import qos
 from avatar_ros.nodes.slicer_bridge import SLICER_BRIDGE
@@ -28,6 +30,7 @@ from avatar_ros.slicer import messages
 from avatar_ros.slicer.follower import LONGEST, Follower
 from avatar_ros.slicer.link import MAX_BODY, Link
 from tests.helpers.slowness import Deadline, end_of, wait_until, within
+from tests.ros.conftest import Probe
 from tests.ros.helpers.doc_pages import parameter_rows, yaml_parameters
 from tests.ros.helpers.hand import wait_for_model
 from tests.ros.helpers.running import running
@@ -178,6 +181,14 @@ def test_one_tool_of_several_is_told(own_domain: dict[str, str], probe: Any) -> 
     assert len(found) > 10 and all("jumped" in text for text in found)  # of 30
 
 
+def build(probe: Any, slicer: Any, line: str, is_heard: Callable[[], bool]) -> None:
+    """Send a line until it has an effect: an early one is lost."""
+    passed = Deadline(SECONDS)
+    while not is_heard() and not passed:
+        slicer.send_message(messages.text(messages.BUILD, line))
+        probe.spin(1.0)
+
+
 def test_a_patient_is_built_by_a_line(probe: Any, slicer: Any) -> None:
     """The line names file and fidelity; stages and outcome come back."""
     goals: list[Any] = []
@@ -191,15 +202,43 @@ def test_a_patient_is_built_by_a_line(probe: Any, slicer: Any) -> None:
 
     server = ActionServer(probe.node, BuildPatient, "build_patient", built)
     try:
-        passed = Deadline(SECONDS)
-        while not goals and not passed:
-            slicer.send_message(messages.text(messages.BUILD, "new liver.stl reduced"))
-            probe.spin(1.0)
+        build(probe, slicer, "new liver.stl reduced", lambda: bool(goals))
         assert (goals[0].surface, goals[0].fidelity) == ("new liver.stl", "reduced")
         said = heard(slicer, probe, messages.BUILD, lambda m: "choose another" in m.string)
         assert said.string == "no such surface; choose another"
     finally:
         server.destroy()
+
+
+def test_a_patient_that_was_built_is_loaded(own_domain: dict[str, str]) -> None:
+    """The bridge asks the loader for the file of the result, and goes on."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = int(free.getsockname()[1])
+    loaded: list[str] = []
+
+    def built(handle: Any) -> Any:
+        handle.succeed()
+        return BuildPatient.Result(success=True, file="new liver.h5", seconds=2.0)
+
+    def load(request: Any, response: Any) -> Any:
+        loaded.append(request.name)
+        response.message = "refused by the library"
+        return response
+
+    with closing(Probe()) as other:
+        # in a namespace, where no other loader answers
+        server = ActionServer(other.node, BuildPatient, "/own/build_patient", built)
+        other.node.create_service(LoadVademecum, "/own/load_vademecum", load)
+        words = ["-r", "__ns:=/own"]
+        with running("slicer_bridge", own_domain, f"port:={port}", words=words) as bridge:
+            client = pyigtl.OpenIGTLinkClient("127.0.0.1", port)
+            build(other, client, "new liver.stl", lambda: bool(loaded or bridge.poll()))
+            assert bridge.poll() is None and loaded, bridge.said()
+            said = heard(client, other, messages.BUILD, lambda m: "library" in m.string)
+            assert said.string == "refused by the library"
+            client.stop()
+        server.destroy()
+    assert set(loaded) == {"new liver.h5"}
 
 
 def test_a_second_bridge_says_that_the_port_is_taken(

@@ -14,6 +14,7 @@ from geometry_msgs.msg import PoseStamped
 from shape_msgs.msg import Mesh
 
 from avatar_core.geometry.tip import MAX_TOOLS
+from avatar_interfaces.action import BuildPatient
 from avatar_interfaces.msg import ContactState, VademecumInfo
 from avatar_ros.framework import qos
 from avatar_ros.framework.announced import Announced
@@ -228,9 +229,9 @@ class SlicerBridge(ManagedNode):
             Wanted(file, fidelity=fidelity), self._say_stage, self._say, self._load_patient
         )
 
-    def _load_patient(self, file: str) -> None:
-        if file and self._requests is not None:
-            self._requests.load_vademecum(file, self._say)
+    def _load_patient(self, result: BuildPatient.Result | None) -> None:
+        if result is not None and self._requests is not None:
+            self._requests.load_vademecum(result.file, self._say)
 
     def _say_stage(self, stage: str, fraction: float, error: float) -> None:
         self._say(f"{stage} {fraction:.0%}")

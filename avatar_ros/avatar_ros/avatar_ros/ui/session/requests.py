@@ -67,7 +67,7 @@ class _Build:
     """Callbacks of a build: text, and result; has_first: an interpolated vademecum is written."""
 
     report: Report
-    then: Callable[[Any], None]
+    then: Callable[[BuildPatient.Result | None], None]
     has_first: bool = False
 
 
@@ -205,7 +205,7 @@ class Requests:
         wanted: Wanted,
         progress: Progress,
         report: Report,
-        then: Callable[[Any], None],
+        then: Callable[[BuildPatient.Result | None], None],
         first: Callable[[str], None] = lambda file: None,
     ) -> None:
         """Build or preview a patient; call ``then`` with the result, None if there is none.
