@@ -47,11 +47,13 @@ def usable(material: dict[str, float]) -> dict[str, float]:
 def cell() -> Noted:
     """Return a note of the requests to page and nodes; it refuses a scene and a value."""
     there = {"material.young_modulus": 90e3}
-    return Noted(
+    noted = Noted(
         set_material=answer_material,
         parameters_of_contact=lambda names, then: then(UNSET | there),
         load_scene=lambda name, report, yaml, then: then(name != "refused"),
     )
+    noted.__dict__["is_setting"] = False
+    return noted
 
 
 @pytest.fixture
@@ -127,6 +129,46 @@ def test_what_another_client_sets_is_shown_once(chosen: Chosen, cell: Noted) -> 
         chosen.follow_contact({"material.young_modulus": 8e3, "uncertainty": ""})
     assert chosen.given == {"young": 8e3}
     assert cell.of("show_material") == [{"young": 8e3, "poisson": 0.48}]
+
+
+def test_a_recording_ends_where_another_program_changes_the_material(
+    chosen: Chosen, cell: Noted
+) -> None:
+    """Its scene holds one material; what changes none, and the page's own values, end nothing."""
+    chosen.note_contact(UNSET | {"uncertainty": ""})
+    chosen.choose_material({"young": 50e3})
+    assert cell.of("stop_recording") == ["the material changed"]  # a new one may begin now
+    here = {"material.young_modulus": 50e3}
+    for same in (
+        {},
+        here,
+        here | {"uncertainty": "liver.yaml"},
+        here | {"material.contrast": 5.0},  # the organ has no tumour
+        here | {"material.poisson_ratio": 0.48},  # as built
+    ):
+        chosen.follow_contact(same)
+    assert len(cell.of("stop_recording")) == 1
+    for _ in range(3):  # it is asked once a second
+        chosen.follow_contact({"material.young_modulus": 90e3})
+    assert cell.of("stop_recording")[1:] == ["another program changed the material"]
+    assert chosen.given["young"] == 90e3  # not the page's earlier choice
+    chosen.follow_contact({"material.young_modulus": UNSET["material.young_modulus"]})
+    assert cell.of("stop_recording")[2:] == ["another program changed the material"]
+    assert chosen.organ is not None and chosen.values(chosen.organ)["young"] == 170e3
+
+
+def test_values_on_their_way_are_not_taken_for_those_of_another_program(
+    chosen: Chosen, cell: Noted
+) -> None:
+    """The contact node may answer with a step of the slider before the last."""
+    chosen.choose_material({"young": 50e3})
+    chosen.choose_material({"young": 60e3})
+    before = len(cell.of("stop_recording"))
+    cell.__dict__["is_setting"] = True
+    chosen.follow_contact({"material.young_modulus": 50e3})
+    cell.__dict__["is_setting"] = False
+    chosen.follow_contact({"material.young_modulus": 60e3})
+    assert len(cell.of("stop_recording")) == before and chosen.given["young"] == 60e3
 
 
 def test_a_value_of_the_scene_is_shown(chosen: Chosen, cell: Noted, tmp_path: Path) -> None:

@@ -98,7 +98,9 @@ def test_a_contact_node_that_starts_again_is_asked_again() -> None:
     for young in (1e3, 2e3, 3e3):
         requests.set_material({"young": young}, print)
     assert silent.asked == [1e3]  # the others wait for its answer
+    assert requests.is_setting
     requests.contact_started()
+    assert not requests.is_setting
     requests.set_material({"young": 4e3}, print)
     assert silent.asked == [1e3, 4e3]
 

@@ -195,12 +195,28 @@ class Chosen:
 
     def show_material(self) -> None:
         """Show the values in force, those of the scene among them."""
-        self._page.show_material(self.values(self.organ) if self.organ else self.given)
+        self._page.show_material(self._shown)
+
+    @property
+    def _shown(self) -> dict[str, float]:
+        """Return the values in force that the organ uses, by coordinate [SI]."""
+        return self.values(self.organ) if self.organ else self.given
 
     def follow_contact(self, values: dict[str, Any]) -> None:
-        """Note parameters of the contact node if any has changed."""
-        if any(self.contact.get(name) != value for name, value in values.items()):
-            self.note_contact(values)
+        """Note parameters of the contact node if any has changed.
+
+        A recording holds one material, so a change by another program ends it.
+        """
+        changed = {key: value for key, value in values.items() if self.contact.get(key) != value}
+        if not changed or self._requests.is_setting:  # they may be older than this page's
+            return
+        before = self._shown
+        for key in changed.keys() & MATERIAL.keys():
+            if self._material.get(MATERIAL[key]) != changed[key]:
+                self._material.pop(MATERIAL[key], None)
+        self.note_contact(values)
+        if self._shown != before:
+            self._page.stop_recording("another program changed the material")
 
     def choose_scene(self, name: str) -> None:
         """Switch to a shipped scene."""

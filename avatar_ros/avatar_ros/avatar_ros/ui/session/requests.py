@@ -108,6 +108,11 @@ class Requests:
         return self._switch[0], time.monotonic() - self._switch[1]
 
     @property
+    def is_setting(self) -> bool:
+        """Return whether values of the material are still on their way to the contact node."""
+        return self._setting
+
+    @property
     def missing(self) -> tuple[str, ...]:
         """Name the nodes whose services are not available."""
         ready = {
