@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache
+from hashlib import sha256
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -59,6 +60,18 @@ def compiled_for(kernel: Any, *types: Any) -> Any:
     return kernel.get_overload(types)
 
 
+_WITH_MEMORY = ("viscoelasticity", "inertia")  # effects of which a loop keeps a history
+
+
+def _digest_of_memory(arrays: dict[str, np.ndarray]) -> bytes:
+    """Return the digest of load modes, tips and the effects that keep a history."""
+    digest = sha256()
+    for name, array in arrays.items():
+        if name in ("load", "tip_offset") or name.startswith(_WITH_MEMORY):
+            digest.update(name.encode() + array.tobytes())
+    return digest.digest()
+
+
 class ContactModel:
     """The constant part of a contact simulation: an organ, its tools and effects.
 
@@ -70,6 +83,8 @@ class ContactModel:
         Where they lie, for compiled code.
     compiled : callable
         The step, the same for all models.
+    memory : bytes
+        Digest of what a load history belongs to: models with the same can go on with it.
 
     Examples
     --------
@@ -80,6 +95,7 @@ class ContactModel:
 
     def __init__(self, arrays: Any) -> None:
         self.arrays, self.table, self.compiled = arrays, ArrayTable(arrays), compiled_step()
+        self.memory = _digest_of_memory(flat(arrays))
 
     def data(self) -> ContactData:
         """The data of a loop, of an organ at rest without any contact. Not real-time safe."""
@@ -170,6 +186,11 @@ class ContactData:
                 self._resume_jaw(before, tool)
         if mine.respiration is not None and theirs.respiration is not None:
             mine.respiration.clock[:] = theirs.respiration.clock
+        if self.model.memory == before.model.memory:
+            for name in _WITH_MEMORY:
+                if getattr(mine, name) is not None:
+                    for own, other in zip(getattr(mine, name), getattr(theirs, name), strict=True):
+                        own[:] = other
 
     def _resume_jaw(self, before: ContactData, tool: int) -> None:
         """Take over what a jaw holds; without a jaw here, as if it had been opened."""

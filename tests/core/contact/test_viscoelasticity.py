@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avatar_core.contact.effects import Viscoelasticity
+from avatar_core.contact.effects import Effect, Inertia, Viscoelasticity
+from avatar_core.contact.model import deform
 from avatar_core.contact.tool_path import slide
 from avatar_core.geometry.tip import Tip
 from avatar_core.vademecum.model import Vademecum
+from tests.helpers.coarse_liver import RADIUS, liver, spots
 from tests.helpers.contact import prepare, step
 from tests.helpers.flat_organ import COMPLIANCE, at_depth, flat_organ, force_at_depth
 from tests.helpers.tool_motion import AWAY
@@ -142,3 +144,27 @@ def test_a_history_moves_the_cloud_as_its_loads_do(phantom_vademecum: Vademecum)
             wrong = data.out.cloud[:, 3:].ravel() - exact
             errors.append(np.sqrt((mass * wrong**2).sum() / (mass * exact**2).sum()))
     assert np.mean(errors) < 1e-2
+
+
+@pytest.mark.parametrize("effects", [(PRONY,), (PRONY, Inertia())])
+def test_another_model_of_the_same_material_goes_on_with_the_history(
+    effects: tuple[Effect, ...],
+) -> None:
+    """Force and cloud go on; another relaxation begins at rest, with all of the force."""
+    spot, tip = spots()[0], Tip("sphere", RADIUS)
+    data = prepare(liver(), (tip,), effects=effects)
+    for depth in [*np.linspace(-1e-3, 3e-3, 50), *[3e-3] * 3000]:
+        step(data, spot.tip(depth)[None])
+    deform(data.model, data)
+    force, cloud = data.out.force.copy(), data.out.cloud.copy()
+    later = prepare(liver(), (tip,), effects=effects)
+    later.resume(data)
+    step(later, spot.tip(3e-3)[None])
+    deform(later.model, later)
+    np.testing.assert_allclose(later.out.force, force, rtol=1e-3)
+    np.testing.assert_allclose(later.out.cloud, cloud, atol=1e-6)
+    other = prepare(liver(), (tip,), effects=(Viscoelasticity((0.5,), (0.1,)), *effects[1:]))
+    other.resume(data)
+    for _ in range(5):
+        step(other, spot.tip(3e-3)[None])
+    assert np.linalg.norm(other.out.force) > 1.3 * np.linalg.norm(force)
