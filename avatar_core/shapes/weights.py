@@ -89,10 +89,17 @@ class Barycenter:
 
 def local_gram(point: FloatArray, neighbors: Vectors) -> FloatArray:
     """Return C_jk = (X_j - x) . (X_k - x), from differences, shape (k, k)."""
+    difference = _differences(point, neighbors)
+    return difference @ difference.T
+
+
+def _differences(point: FloatArray, neighbors: Vectors) -> FloatArray:
+    """Return X_j - x in double precision, of vectors of any number type, shape (k, D)."""
     difference = np.empty((len(neighbors), len(point)))
     for row, neighbor in zip(difference, neighbors, strict=True):
-        np.subtract(neighbor, point, out=row)  # five times faster than stacking differences
-    return difference @ difference.T
+        # five times faster than stacking differences
+        np.subtract(neighbor, point, out=row, dtype=np.float64)
+    return difference
 
 
 def barycenter_weights(gram: FloatArray, regularization: float) -> FloatArray:
@@ -185,16 +192,16 @@ def barycenter(
     if distance[0] <= SAME * size:
         off, whole = float(distance[0]), np.eye(1, k)[0]
         return Barycenter(chosen, whole, distance, off, 0.0, 1.0, int(chosen[0]), notices)
-    neighbors = [vectors[j] for j in chosen]
-    gram = local_gram(x, neighbors)
+    difference = _differences(x, [vectors[j] for j in chosen])
+    gram = difference @ difference.T
     hull = convex_weights(gram)
     weights = hull if convex else barycenter_weights(gram, regularization)
     return Barycenter(
         neighbors=chosen,
         weights=weights,
         distances=distance,
-        residual=_distance_to(x, neighbors, weights),
-        hull_distance=_distance_to(x, neighbors, hull),
+        residual=float(np.linalg.norm(weights @ difference)),  # as the weights sum to 1
+        hull_distance=float(np.linalg.norm(hull @ difference)),
         condition=_condition(gram),
         notices=notices,
     )
@@ -228,18 +235,19 @@ def kriging(
     found = barycenter(vectors, point, n_neighbors, leave_out=leave_out)
     if found.member is not None:
         return found
-    chosen = np.stack([vectors[j] for j in found.neighbors])
-    k, scale = len(chosen), float(found.distances.mean())
-    squared = (chosen**2).sum(axis=1)
-    apart = np.sqrt(np.maximum(squared[:, None] + squared - 2.0 * chosen @ chosen.T, 0.0))
+    x = checked_vector(point, vectors)
+    difference = _differences(x, [vectors[j] for j in found.neighbors])
+    k, scale = len(difference), float(found.distances.mean())
+    gram = difference @ difference.T  # from the point, as products lose digits far from it
+    squared = np.diag(gram)
+    apart = np.sqrt(np.maximum(squared[:, None] + squared - 2.0 * gram, 0.0))
     np.fill_diagonal(apart, 0.0)
     system = np.ones((k + 1, k + 1))
     system[:k, :k], system[k, k] = -((apart / scale) ** _VARIOGRAM), 0.0
     right = np.append(-((found.distances / scale) ** _VARIOGRAM), 1.0)
     # least squares, as two equal anatomies make the system singular
     weights = np.linalg.lstsq(system, right, rcond=1e-12)[0][:k]
-    residual = float(np.linalg.norm(np.asarray(point) - weights @ chosen))
-    return replace(found, weights=weights, residual=residual)
+    return replace(found, weights=weights, residual=float(np.linalg.norm(weights @ difference)))
 
 
 def _distances(vectors: Vectors, candidates: IntArray, x: FloatArray) -> FloatArray:
@@ -255,10 +263,6 @@ def _distance(vector: FloatArray, x: FloatArray) -> float:
     if np.shape(vector) != x.shape:
         raise LLEError("lle: the vectors differ in length; compute all on one grid")
     return float(np.linalg.norm(vector - x))
-
-
-def _distance_to(x: FloatArray, neighbors: list[FloatArray], weights: FloatArray) -> float:
-    return float(np.linalg.norm(x - weights @ np.stack(neighbors)))
 
 
 def _condition(gram: FloatArray) -> float:

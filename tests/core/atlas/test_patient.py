@@ -33,7 +33,7 @@ from avatar_core.reduction.galerkin import (
     residual_compliance_blocks,
     solve_probes,
 )
-from avatar_core.shapes.weights import barycenter, kriging
+from avatar_core.shapes.weights import barycenter
 from tests.helpers.bent_base import bent_phantoms, patient_mesh, registration_of
 from tests.helpers.known_surfaces import ball
 
@@ -75,26 +75,6 @@ def _weights(case: Case):  # type: ignore[no-untyped-def]
 
 
 # --- weights ----------------------------------------------------------------------------------
-
-
-def test_kriging_weights_sum_to_one_and_know_a_member() -> None:
-    vectors = np.random.default_rng(0).standard_normal((6, 40))
-    outside = kriging(list(vectors), vectors.mean(axis=0) + 0.1, 6)
-    assert outside.weights.sum() == pytest.approx(1.0, abs=1e-10)  # the constraint of the system
-    member = kriging(list(vectors), vectors[4], 6)
-    assert member.member == 4
-    assert member.combine(list(vectors)).tobytes() == vectors[4].tobytes()
-
-
-def test_a_duplicate_in_the_base_does_not_break_kriging() -> None:
-    vectors = np.random.default_rng(1).standard_normal((5, 30))
-    doubled = np.vstack([vectors, vectors[2]])
-    point = vectors.mean(axis=0) + 0.3
-    single, double = kriging(list(vectors), point, 5), kriging(list(doubled), point, 6)
-    # the twins divide one weight; the system is singular, hence not to rounding
-    np.testing.assert_allclose(
-        double.combine(list(doubled)), single.combine(list(vectors)), atol=1e-6
-    )
 
 
 def test_scans_of_one_person_are_left_out_together(case: Case) -> None:
