@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import igl
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from avatar_core.common.arrays import FloatArray, IntArray
+from avatar_core.errors import AvatarError
 from avatar_core.geometry.mesh import TetMesh
 
 _SLACK = 1e-9  # barycentric coordinates down to minus this count as inside
+_FARTHEST_OUTSIDE = 5e-3  # largest distance of a target from the organ [m]
 
 
 def carriers(mesh: TetMesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -32,6 +35,25 @@ def carriers(mesh: TetMesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
     corners[outside] = faces[face][:, [0, 1, 2, 0]]
     weights[outside] = np.pad(on_face, ((0, 0), (0, 1)))
     return corners, weights
+
+
+def target_carriers(
+    mesh: TetMesh, point: ArrayLike, refusal: type[AvatarError]
+) -> tuple[IntArray, FloatArray]:
+    """Return the vertices of a mesh that carry a point of the organ, and their weights, each (4,).
+
+    Raises ``refusal`` if the point is not finite or lies more than 5 mm outside the organ.
+    """
+    asked = np.asarray(point, float)
+    if asked.shape != (3,) or not np.isfinite(asked).all():
+        raise refusal(f"the target is {asked.tolist()}; give three finite numbers, in metres")
+    corners, weights = carriers(mesh, asked[None])
+    off = float(np.linalg.norm(weights[0] @ mesh.vertices[corners[0]] - asked))
+    if off > _FARTHEST_OUTSIDE:
+        raise refusal(
+            f"the target lies {1e3 * off:.0f} mm outside the organ; give a point in it, in metres"
+        )
+    return corners[0], weights[0]
 
 
 def locate(mesh: TetMesh, points: FloatArray) -> tuple[IntArray, FloatArray]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import RegistrationError
 from avatar_core.fem.norms import mean_gradient, mean_strain
-from avatar_core.geometry.point_location import carriers
+from avatar_core.geometry.point_location import target_carriers
 from avatar_core.registration.choice import chosen, posed
 from avatar_core.registration.cloud import Cloud
 from avatar_core.registration.fit import Fit
@@ -38,7 +38,6 @@ _MOST_STRAIN = 0.15
 SEEN = 0.015  # largest distance of a seen vertex from the cloud [m]
 _OUT_OF_SIGHT = 0.05  # distance beyond which the cloud does not reduce the model's error [m]
 _MOST_HIDDEN = 0.1  # fraction of unseen vertices that may be undetermined in a good answer
-_INSIDE = 5e-3  # largest distance of a target from the organ [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,18 +234,10 @@ class Registered:
         Raises
         ------
         RegistrationError
-            If the point lies more than 5 mm outside the organ.
+            If the point is not finite or lies more than 5 mm outside the organ.
         """
-        asked = np.asarray(point, float)
-        corners, weights = carriers(self.vademecum.mesh, asked[None])
-        found = self.estimate("target", corners[0], weights[0])
-        off = float(np.linalg.norm(found.rest - asked))
-        if off > _INSIDE:
-            raise RegistrationError(
-                f"the target lies {1e3 * off:.0f} mm outside the organ; give a point in it, in "
-                "metres"
-            )
-        return found
+        corners, weights = target_carriers(self.vademecum.mesh, point, RegistrationError)
+        return self.estimate("target", corners, weights)
 
     def targets(self) -> list[Estimate]:
         """Return the present places of the middles of structures inside, e.g. tumours."""

@@ -55,7 +55,7 @@ def bands_section(surface: SurfaceMesh, settings: CertaintySettings, bar: Progre
     vademecum, problem = _small_organ(settings, bar)
     known, places = known_of(vademecum, KNOWN), starts_apart(vademecum, settings.n_places)
     start = process_time()
-    table = force_table(vademecum, Tip("patch", 8e-3), places, [_DEPTH], target=0)
+    table = force_table(vademecum, Tip("patch", 8e-3), places, [_DEPTH], vademecum.mesh.vertices[0])
     ours = bands_of(table, known, settings.n_draws).force[:, :, 0]
     seconds = process_time() - start
     bar.begin("draws of the full problem")

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 from scipy.stats import qmc, sobol_indices
 
 from avatar_core.common.arrays import FloatArray
-from avatar_core.errors import ContactError
+from avatar_core.errors import AvatarError, ContactError
+from avatar_core.geometry.point_location import target_carriers
 from avatar_core.geometry.tip import MAX_DEPTH, Tip
 from avatar_core.uncertainty.distributions import Distribution, Fixed
 from avatar_core.uncertainty.force_table import ForceTable, force_table
@@ -84,9 +85,9 @@ def force_bands(
         Point whose displacement is asked for [m]. The default is the tumour, or the middle of the
         organ.
     draws : int
-        Number of draws.
+        Number of draws, at least 1.
     seed : int
-        Seed of the draws.
+        Seed of the draws, at least 0.
     progress : callable
         Called with the number of finished materials, and of all.
 
@@ -99,9 +100,12 @@ def force_bands(
     LoadError
         If a point lies more than 5 mm off the accessible surface.
     ContactError
-        If the depths do not rise, the target lies outside the organ, or no force acts on the tip.
+        If the depths do not rise, the target lies more than 5 mm outside the organ, or no force
+        acts on the tip.
     CoordinateError
         If the vademecum has no such parameter.
+    AvatarError
+        If there are no draws, or the seed is negative.
 
     Examples
     --------
@@ -112,35 +116,34 @@ def force_bands(
     ((3, 1, 2), True)
     """
     deep = np.atleast_1d(np.asarray(depths, float))
-    if not (deep[0] > 0.0 and deep[-1] <= MAX_DEPTH and (np.diff(deep) > 0.0).all()):
+    rise = deep.ndim == 1 and deep.size > 0 and (np.diff(deep, prepend=0.0) > 0.0).all()
+    if not (rise and deep[-1] <= MAX_DEPTH):
         raise ContactError(
             f"depths are {deep.tolist()} m; give rising numbers above 0, up to {MAX_DEPTH:g}"
         )
+    if draws < 1:
+        raise AvatarError(f"{draws} draws span no band; give 1 or more, e.g. 1000")
+    if seed < 0:
+        raise AvatarError(f"the seed is {seed}; give 0 or more")
     centers, places = vademecum.surface.centers, []
     for point in np.asarray(points, float).reshape(-1, 3):
         vademecum.surface.nearest(point)  # refuses points off the surface
         places.append(int(np.argmin(np.linalg.norm(centers - point, axis=1))))
-    all_known, vertex = known_of(vademecum, known), _target(vademecum, target)
-    table = force_table(vademecum, tip or Tip(), places, deep.tolist(), vertex, progress)
+    all_known, aim = known_of(vademecum, known), _target(vademecum, target)
+    table = force_table(vademecum, tip or Tip(), places, deep.tolist(), aim, progress)
     return bands_of(table, all_known, draws, seed)
 
 
-def _target(vademecum: Vademecum, point: ArrayLike | None) -> int:
-    """Return the vertex whose displacement is asked for."""
-    vertices = vademecum.mesh.vertices
+def _target(vademecum: Vademecum, point: ArrayLike | None) -> FloatArray:
+    """Return the point whose displacement is asked for, shape (3,) [m]."""
     if point is not None:
-        at = np.asarray(point, float)
-        if not ((at >= vertices.min(axis=0)) & (at <= vertices.max(axis=0))).all():
-            raise ContactError(
-                f"the target {at.tolist()} lies outside of the organ; give a point in it, in metres"
-            )
-    elif vademecum.structures:
+        target_carriers(vademecum.mesh, point, ContactError)  # refuses points outside
+        return np.asarray(point, float)
+    if vademecum.structures:
         assert vademecum.display is not None  # which holds them
         (faces, *_) = vademecum.structures.values()
-        at = vademecum.display.vertices[np.unique(faces)].mean(axis=0)
-    else:
-        at = vertices.mean(axis=0)
-    return int(np.argmin(np.linalg.norm(vertices - at, axis=1)))
+        return np.asarray(vademecum.display.vertices[np.unique(faces)].mean(axis=0))
+    return np.asarray(vademecum.mesh.vertices.mean(axis=0))
 
 
 def drawn(known: Mapping[str, Distribution], n: int, seed: int) -> dict[str, FloatArray]:
@@ -169,8 +172,8 @@ def _shares(
     free = {name: one for name, one in known.items() if not isinstance(one, Fixed)}
     fixed = {name: one for name, one in known.items() if isinstance(one, Fixed)}
     shape = table.log_force.shape[1:]
-    if not free:
-        return {}
+    if len(free) < 2:
+        return {name: np.ones(shape) for name in free}
 
     def log_force(columns: FloatArray) -> FloatArray:
         values = dict(zip(free, columns, strict=True))

@@ -50,6 +50,10 @@ class Fixed:
 
     value: float
 
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.value):
+            raise CoordinateError(f"fixed:{self.value:g}: give a finite number")
+
     def ppf(self, probability: FloatArray) -> FloatArray:
         """Return the quantiles at some probabilities (0 to 1)."""
         return np.full(np.shape(probability), self.value)
@@ -77,8 +81,10 @@ class Uniform:
     high: float
 
     def __post_init__(self) -> None:
-        if not self.low < self.high:
-            raise CoordinateError(f"uniform:{self.low:g}:{self.high:g} is empty; give LOW < HIGH")
+        if not -math.inf < self.low < self.high < math.inf:
+            raise CoordinateError(
+                f"uniform:{self.low:g}:{self.high:g} is empty; give finite LOW < HIGH"
+            )
 
     def ppf(self, probability: FloatArray) -> FloatArray:
         """Return the quantiles at some probabilities (0 to 1)."""
@@ -143,10 +149,10 @@ class Lognormal:
     factor: float
 
     def __post_init__(self) -> None:
-        if not (self.median > 0.0 and self.factor > 1.0 and math.isfinite(self.factor)):
+        if not (0.0 < self.median < math.inf and 1.0 < self.factor < math.inf):
             raise CoordinateError(
                 f"lognormal:{self.median:g}:{self.factor:g}: give a positive median and a factor "
-                "above 1"
+                "above 1, both finite"
             )
 
     def ppf(self, probability: FloatArray) -> FloatArray:

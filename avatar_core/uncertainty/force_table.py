@@ -18,6 +18,7 @@ from avatar_core.contact.layout import Shape, lay_out
 from avatar_core.contact.model import ContactModel, Status, step
 from avatar_core.errors import ContactError
 from avatar_core.fem.patch_loads import LoadSurface
+from avatar_core.geometry.point_location import carriers
 from avatar_core.geometry.tip import Tip
 from avatar_core.uncertainty.material_grid import MaterialGrid
 from avatar_core.vademecum.accuracy import Detail
@@ -61,7 +62,7 @@ def force_table(
     tip: Tip,
     places: Sequence[int],
     depths: Sequence[float],
-    target: int,
+    target: FloatArray,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> ForceTable:
     """Press at load positions, at every point of the coordinates; return the table.
@@ -72,8 +73,8 @@ def force_table(
         Load positions.
     depths : Sequence[float]
         Depths of the tip below the surface, rising [m].
-    target : int
-        Vertex whose displacement is asked for.
+    target : ndarray, shape (3,)
+        Point of the organ whose displacement is asked for [m].
     progress : Callable[[int, int], None]
         Called with the number of finished materials, and of all.
 
@@ -127,11 +128,12 @@ def _pressed(
     return force
 
 
-def _motion(vademecum: Vademecum, places: Sequence[int], target: int) -> FloatArray:
-    """Return a vertex's displacement by a unit normal force at each place, (n,) [m/N]."""
-    normals, three = vademecum.surface.normals, slice(3 * target, 3 * target + 3)
-    found = []
+def _motion(vademecum: Vademecum, places: Sequence[int], target: FloatArray) -> FloatArray:
+    """Return a point's displacement by a unit normal force at each place, (n,) [m/N]."""
+    corners, weights = carriers(vademecum.mesh, target[None])
+    normals, found = vademecum.surface.normals, []
     for j in places:
-        by_axis = vademecum.displacement(np.array([j]), np.ones(1))[three]
-        found.append(np.linalg.norm(by_axis @ normals[j]))
+        by_axis = vademecum.displacement(np.array([j]), np.ones(1)).reshape(-1, 3, 3)
+        moved = np.tensordot(weights[0], by_axis[corners[0]], 1)
+        found.append(np.linalg.norm(moved @ normals[j]))
     return np.array(found)

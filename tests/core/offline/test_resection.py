@@ -114,14 +114,13 @@ def test_a_material_is_unknown_at_the_opening_that_was_chosen(organ: Vademecum) 
     place, depth, young = middle_of_access(organ), 2e-3, 5e3
     for opened in (0.0, 0.5):
         here = organ.at(resection=opened)
-        found = force_table(here, Tip(), [place], [depth, 2 * depth], 0).force(
-            {"young": np.array([young])}
-        )
+        found = force_table(here, Tip(), [place], [depth, 2 * depth], here.mesh.vertices[0])
+        force = found.force({"young": np.array([young])})
         tip = (Tip(),)
         soft = prepare(here.at(young=young), tip, cloud="off", effects=())
         surface = here.surface
         truth = press(soft, tip, surface.centers[[place]], surface.normals[[place]], (depth,))[0]
-        np.testing.assert_allclose(found.ravel()[0], truth, rtol=1e-3)
+        np.testing.assert_allclose(force.ravel()[0], truth, rtol=1e-3)
         edges = log_edges(here, tip, known_of(here, {"young": Lognormal(young, 1.3)}))
         assert np.isfinite(edges).all()
 
