@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from avatar_core.common.arrays import FloatArray
+from avatar_core.common.arrays import FloatArray, IntArray
 from avatar_core.errors import RegistrationError
 from avatar_core.fem.norms import mean_gradient, mean_strain
 from avatar_core.geometry.point_location import target_carriers
@@ -198,7 +198,7 @@ class Registered:
         square = (spread**2).sum(axis=2) + self.model_deviation[:, None] ** 2
         return np.asarray(np.sqrt(square))
 
-    def estimate(self, name: str, vertices: FloatArray, weights: FloatArray) -> Estimate:
+    def estimate(self, name: str, vertices: IntArray, weights: FloatArray) -> Estimate:
         """Return the estimate for a weighted mean of vertices, whose weights sum to one.
 
         Parameters
