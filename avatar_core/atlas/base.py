@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
-from avatar_core.atlas.model import MOST_NEIGHBORS, Atlas, Lazy
+from avatar_core.atlas.model import MOST_NEIGHBORS, Atlas, Lazy, centred, first_equal
 from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import AvatarError
 from avatar_core.fem.elasticity import Material
@@ -40,8 +41,6 @@ class PatientBase:
         n arrays of shape (n_template, 3) [m], the template registered to each anatomy.
     responses : Sequence[CompactResponse]
         One response per anatomy; may be a lazy sequence.
-    copies : tuple[int, ...]
-        Numbers of anatomies that repeat an earlier one, and get no weight.
     distances : Sequence[ndarray] or None
         Signed distances of each anatomy on a common grid, n arrays of shape (n_grid,). May be a
         lazy sequence.
@@ -59,11 +58,34 @@ class PatientBase:
     names: tuple[str, ...]
     vertices: Vectors
     responses: Sequence[CompactResponse]
-    copies: tuple[int, ...] = ()
     distances: Sequence[FloatArray] | None = None
     distance_of: Callable[[SurfaceMesh, Registration], FloatArray] | None = None
     rule: TemplateRule = field(default_factory=TemplateRule)
     registration_of: Callable[[str], Registration | None] = _unknown
+
+    @cached_property
+    def same_as(self) -> tuple[int, ...]:
+        """Number of the first anatomy with the same shape, mostly its own, for each anatomy."""
+        return tuple(first_equal(centred(self.vertices)).tolist())
+
+    @property
+    def copies(self) -> tuple[int, ...]:
+        """Numbers of the anatomies that repeat an earlier one; they get no weight."""
+        return tuple(k for k, first in enumerate(self.same_as) if first != k)
+
+    def without(self, leave_out: Collection[int] = ()) -> list[int]:
+        """Return the anatomies that get no weight: some, their copies, and all further copies.
+
+        Raises PatientError for a number that the base does not have.
+        """
+        n, same = len(self.names), self.same_as
+        for number in leave_out:
+            if not 0 <= number < n:
+                raise PatientError(
+                    f"no anatomy has the number {number} to leave out; choose from 0 to {n - 1}"
+                )
+        left = {same[number] for number in leave_out}
+        return sorted({*self.copies, *(k for k in range(n) if same[k] in left)})
 
 
 def base_of(atlas: Atlas) -> PatientBase:
@@ -96,7 +118,6 @@ def base_of(atlas: Atlas) -> PatientBase:
         names=tuple(anatomy.name for anatomy in anatomies),
         vertices=[anatomy.registered for anatomy in anatomies],
         responses=Lazy(lambda k: atlas.read_response(anatomies[k]), n, MOST_NEIGHBORS),
-        copies=tuple(k for k, i in enumerate(kept) if atlas.same_as[i] != i),
         distances=Lazy(lambda k: atlas.read_distances(anatomies[k]), n, MOST_NEIGHBORS),
         distance_of=lambda surface, registration: frame.distance_vector(
             surface, registration.alignment
@@ -109,13 +130,16 @@ def base_of(atlas: Atlas) -> PatientBase:
 
 
 def leave_one_out(base: PatientBase, name: str, same: Collection[Collection[str]]) -> list[int]:
-    """Return the anatomies to leave out for a patient: itself and others of the same person."""
-    persons = [set(group) for group in same if name in group]
-    return [
-        i
-        for i, other in enumerate(base.names)
-        if other == name or any(other in group for group in persons)
+    """Return the anatomies to leave out for a patient: all of the same person or the same shape."""
+    shapes = [
+        {other for other, k in zip(base.names, base.same_as, strict=True) if k == first}
+        for first in set(base.same_as)
     ]
+    person, before = {name}, set[str]()
+    while person != before:  # a copy of one scan belongs to the person of all others
+        before = set(person)
+        person = person.union(*(group for group in (*same, *shapes) if person & set(group)))
+    return [i for i, other in enumerate(base.names) if other in person]
 
 
 def numbers_of(base: PatientBase, names: Collection[str]) -> tuple[int, ...]:

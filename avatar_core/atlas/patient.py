@@ -83,7 +83,8 @@ class PatientOptions:
         Number of unseen loads of the certificate. None takes 24, or 200 with ``solved``; 0 makes
         no certificate.
     leave_out : tuple of int
-        Numbers of anatomies that get no weight, such as other scans of the patient.
+        Numbers of anatomies that get no weight, such as other scans of the patient. Their copies
+        get none either.
     groups : mapping of ndarray or None
         Points that are clamped, accessible or held, instead of the template's; see
         :func:`avatar_core.atlas.patient_problem.patient_problem`.

@@ -65,12 +65,13 @@ def patient_weights(
     n_neighbors : int or None
         k; None for the 64 nearest, 40 with "lle-template" and 10 with "lle-paper".
     leave_out : Collection[int]
-        Anatomies that get no weight.
+        Anatomies that get no weight; their copies get none either.
 
     Raises
     ------
     PatientError
-        For an unknown weighting, or one on the grid with a base that has no grid distances.
+        For an unknown weighting, one on the grid with a base that has no grid distances, or a
+        number to leave out that the base does not have.
     LLEError
         For k <= 0 or a base with no anatomy left.
     """
@@ -78,7 +79,7 @@ def patient_weights(
         raise PatientError(
             f"unknown weighting {weighting!r}; choose one of {', '.join(get_args(Weighting))}"
         )
-    left = sorted({*leave_out, *base.copies})
+    left = base.without(leave_out)
     available = len(base.names) - len(left)
     if weighting in ("lle-grid", "lle-paper"):
         if base.distances is None or base.distance_of is None:

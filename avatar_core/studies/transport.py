@@ -218,7 +218,7 @@ def _left_out(
     moved: np.ndarray,
 ) -> float:
     """Return a member's mean error from the others; those of the same person are left out."""
-    out = sorted({*leave_one_out(base, base.names[i], SAME_SUBJECT), *base.copies})
+    out = base.without(leave_one_out(base, base.names[i], SAME_SUBJECT))
     k = min(k, len(base.names) - len(out))
     if kind == "kriging":
         found = kriging(vectors, vectors[i], k, out)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from avatar_core.atlas.base import PatientBase, PatientError, leave_one_out
+from avatar_core.atlas.base import PatientBase, PatientError
 from avatar_core.atlas.model import centred
 from avatar_core.atlas.patient import PatientOptions, build_patient, patient_vademecum
 from avatar_core.atlas.patient_problem import (
@@ -72,18 +72,6 @@ def _error(case: Case, estimate: np.ndarray) -> np.ndarray:
 
 def _weights(case: Case):  # type: ignore[no-untyped-def]
     return patient_weights(case.base, case.problem.registration, case.problem.surface)
-
-
-# --- weights ----------------------------------------------------------------------------------
-
-
-def test_scans_of_one_person_are_left_out_together(case: Case) -> None:
-    out = leave_one_out(case.base, "phantom-1", [("phantom-1", "phantom-3")])
-    assert out == [1, 3]
-    weights = patient_weights(
-        case.base, case.problem.registration, case.problem.surface, leave_out=out
-    )
-    assert not set(out) & set(weights.neighbors)
 
 
 # --- combination --------------------------------------------------------------------------------

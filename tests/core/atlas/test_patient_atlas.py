@@ -89,6 +89,14 @@ def test_a_member_gets_its_own_vademecum_bit_for_bit(
     assert np.array_equal(own.contact_near.block, again.vademecum.contact_near.block)
 
 
+def test_a_copy_of_an_anatomy_without_a_response_has_weight(frame: Frame, tmp_path: Path) -> None:
+    first, *others = _with_responses()
+    bare = replace(first, shape=replace(first.shape, response=None), response=None)
+    copy = replace(first, shape=replace(first.shape, name="liver9"))
+    base = base_of(written(tmp_path / "atlas", frame, [bare, *others, copy]))
+    assert base.names[-1] == "liver9" and base.copies == ()
+
+
 @pytest.mark.long
 def test_copies_count_once(frame: Frame, files: list[Path], tmp_path: Path) -> None:
     members = _with_responses()
