@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
+import numpy as np
+
+from avatar_core.atlas.anatomy import Anatomy, AtlasError
 from avatar_core.atlas.model import MOST_NEIGHBORS, Atlas, Lazy, centred, first_equal
 from avatar_core.common.arrays import FloatArray
 from avatar_core.errors import AvatarError
 from avatar_core.fem.elasticity import Material
 from avatar_core.fem.patch_loads import LoadSurface, load_surface
+from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.reduction.compact_response import CompactResponse
 from avatar_core.shapes.registration import Registration, Template, TemplateRule
@@ -21,7 +26,11 @@ class PatientError(AvatarError):
     """A patient's vademecum cannot be made from the base as requested."""
 
 
-def _unknown(sha256: str) -> Registration | None:
+# Largest difference of the signed distances of two readings of one surface [m]
+_SAME_SURFACE = 1e-7
+
+
+def _unknown(surface: SurfaceMesh) -> Registration | None:
     return None
 
 
@@ -48,8 +57,9 @@ class PatientBase:
         Function that returns the signed distances of a new surface on the same grid.
     rule : TemplateRule
         Rule of all registrations.
-    registration_of : Callable[[str], Registration or None]
-        Function that returns the registration of the anatomy with a hash of its file.
+    registration_of : Callable[[SurfaceMesh], Registration or None]
+        Function that returns the registration of the anatomy with the same surface, if there is
+        one.
     """
 
     template: Template
@@ -61,7 +71,7 @@ class PatientBase:
     distances: Sequence[FloatArray] | None = None
     distance_of: Callable[[SurfaceMesh, Registration], FloatArray] | None = None
     rule: TemplateRule = field(default_factory=TemplateRule)
-    registration_of: Callable[[str], Registration | None] = _unknown
+    registration_of: Callable[[SurfaceMesh], Registration | None] = _unknown
 
     @cached_property
     def same_as(self) -> tuple[int, ...]:
@@ -87,6 +97,12 @@ class PatientBase:
         left = {same[number] for number in leave_out}
         return sorted({*self.copies, *(k for k in range(n) if same[k] in left)})
 
+    def mesh_at(self, number: int, place: FloatArray) -> TetMesh:
+        """Return the template registered to an anatomy, its centroid moved to a place (3,) [m]."""
+        mesh = TetMesh(np.asarray(self.vertices[number], float), self.template.mesh.tets)
+        # the shift is exactly 0, and the mesh the same bit for bit, where the anatomy lay
+        return TetMesh(mesh.vertices + (place - mesh.centroid), mesh.tets)
+
 
 def base_of(atlas: Atlas) -> PatientBase:
     """Return the anatomies of an atlas that have a response; each is read when it is used.
@@ -110,7 +126,6 @@ def base_of(atlas: Atlas) -> PatientBase:
         )
     (kind,) = kinds
     frame, n = atlas.frame, len(kept)
-    by_hash = {one.origin.sha256: one.name for one in anatomies if one.origin.sha256}
     return PatientBase(
         template=frame.template,
         loads=load_surface(frame.template.mesh, frame.template.regions, kind.patch_radius),
@@ -123,10 +138,30 @@ def base_of(atlas: Atlas) -> PatientBase:
             surface, registration.alignment
         ),
         rule=frame.rule,
-        registration_of=lambda sha256: (
-            atlas.registration(by_hash[sha256]) if sha256 in by_hash else None
-        ),
+        registration_of=partial(_known_registration, atlas, anatomies),
     )
+
+
+def _known_registration(
+    atlas: Atlas, anatomies: Sequence[Anatomy], surface: SurfaceMesh
+) -> Registration | None:
+    """Return the registration of the first anatomy that was made of the same surface, if any.
+
+    A file may be read in another unit or by another label, and a surface may be moved later.
+    Surfaces are therefore compared by their signed distances, which tell both shape and place.
+    """
+    for one in anatomies:
+        if len(surface.vertices) != one.origin.n_vertices:
+            continue
+        if not math.isclose(surface.volume, one.volume, rel_tol=1e-9):
+            continue
+        try:
+            distances = atlas.frame.distance_vector(surface, one.alignment)
+        except AtlasError:
+            continue  # it sticks out of the box where the anatomy lies
+        if np.abs(distances - atlas.read_distances(one)).max() <= _SAME_SURFACE:
+            return atlas.registration(one.name)
+    return None
 
 
 def leave_one_out(base: PatientBase, name: str, same: Collection[Collection[str]]) -> list[int]:

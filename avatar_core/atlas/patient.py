@@ -250,7 +250,7 @@ def posed_patient(
     doubts = doubts_of(surface, options.inside, options.groups is not None)
     progress("registration", 0.0, np.nan)
     with _timed(clock, "registration"):
-        known = base.registration_of(surface.source_sha256)
+        known = base.registration_of(surface)
         registration = known or register_template(base.template, surface, base.rule)
     weights = patient_weights(
         base, registration, surface, options.weighting, options.n_neighbors, options.leave_out

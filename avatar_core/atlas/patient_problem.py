@@ -109,12 +109,12 @@ def template_problem(
     Parameters
     ----------
     member : int or None
-        Anatomy of the base that is the patient, on whose own template its response is.
+        Anatomy of the base that is the patient. Its response is on its own registered template,
+        which is moved to the patient.
     """
     template, own = base.template, registration
     if member is not None:
-        mesh = TetMesh(np.asarray(base.vertices[member], float), template.mesh.tets)
-        own = replace(registration, mesh=mesh)
+        own = replace(registration, mesh=base.mesh_at(member, registration.mesh.centroid))
     loads = replace(base.loads, centers=registered_positions(own, base.loads))
     loads = replace(loads, normals=patch_normals(own.mesh, loads.centers, loads.patch_radius))
     elasticity = Elasticity(own.mesh, base.material, template.regions.clamped)

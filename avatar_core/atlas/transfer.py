@@ -25,7 +25,6 @@ from avatar_core.atlas.model import MOST_NEIGHBORS, centred
 from avatar_core.common.arrays import FloatArray
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.patch_loads import LoadSurface
-from avatar_core.geometry.mesh import TetMesh
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.reduction.compact_response import CompactResponse, positive_part
 from avatar_core.shapes.correspondence import interpolation_matrix, load_map
@@ -210,8 +209,7 @@ def carried_by_place(
     mesh, here = elasticity.mesh, registration.mesh.centroid
     moved = []
     for j in weights.neighbors:
-        other = TetMesh(np.asarray(base.vertices[j], float), registration.mesh.tets)
-        placed = TetMesh(other.vertices - other.centroid + here, other.tets)
+        placed = base.mesh_at(int(j), here)
         laid = replace(registration, mesh=placed)
         fields = interpolation_matrix(placed, mesh.vertices)
         positions = load_map(laid, base.loads, surface.centers)

@@ -1,4 +1,4 @@
-"""The anatomies of a base, and which of them get no weight."""
+"""The anatomies of a base: which get no weight, and where a patient with the shape of one lies."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from avatar_core.atlas.base import PatientBase, PatientError, leave_one_out
+from avatar_core.atlas.patient_problem import template_problem
 from avatar_core.atlas.transfer import patient_weights
 from avatar_core.geometry.surface import SurfaceMesh
 from avatar_core.shapes.registration import Registration
@@ -67,3 +68,20 @@ def test_a_patient_left_out_gets_no_weight_by_its_copy(doubled: PatientBase, num
 def test_a_number_that_the_base_lacks_is_refused(bent: Bent, number: int) -> None:
     with pytest.raises(PatientError, match=f"number {number} .* from 0 to 4"):
         patient_weights(bent.base, bent.registration, bent.surface, leave_out=(0, number))
+
+
+# --- a member that lies elsewhere ---------------------------------------------------------------
+
+
+def test_a_patient_with_the_shape_of_a_member_lies_where_it_is(bent: Bent) -> None:
+    shift = np.array([0.1, 0.05, -0.02])
+    here = registration_of(bent.base.template, np.asarray(bent.base.vertices[2]) + shift)
+    surface = SurfaceMesh(here.mesh.vertices, here.mesh.boundary_faces)
+    member = patient_weights(bent.base, here, surface).member
+    assert member == 2
+    problem = template_problem(surface, bent.base, here, member)
+    still = registration_of(bent.base.template, bent.base.vertices[2])
+    before = template_problem(surface, bent.base, still, member)
+    assert np.array_equal(before.mesh.vertices, bent.base.vertices[2])
+    np.testing.assert_allclose(problem.mesh.vertices, here.mesh.vertices, atol=1e-12)
+    np.testing.assert_allclose(problem.loads.centers, before.loads.centers + shift, atol=1e-12)

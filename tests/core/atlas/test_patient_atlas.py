@@ -15,7 +15,8 @@ from avatar_core.atlas.base import PatientError, base_of, numbers_of
 from avatar_core.atlas.frame import Frame
 from avatar_core.atlas.growth import build_anatomy, new_frame
 from avatar_core.atlas.model import Atlas
-from avatar_core.atlas.patient import PatientOptions, patient_vademecum
+from avatar_core.atlas.patient import PatientOptions, patient_vademecum, posed_patient
+from avatar_core.atlas.patient_problem import distances_to_mesh
 from avatar_core.atlas.response import ResponseSolver
 from avatar_core.atlas.storage import load_atlas
 from avatar_core.errors import RegistrationError
@@ -87,6 +88,33 @@ def test_a_member_gets_its_own_vademecum_bit_for_bit(
     for one, other in ((own.far.space, again.vademecum.far.space), (own.far.load,) * 2):
         assert np.array_equal(one, other)
     assert np.array_equal(own.contact_near.block, again.vademecum.contact_near.block)
+
+
+def test_a_surface_is_a_member_by_its_geometry(atlas: Atlas, files: list[Path]) -> None:
+    base, own = base_of(atlas), read_surface(files[2])
+    for surface in (own, SurfaceMesh(own.vertices, own.faces)):  # from a file, and from none
+        known = base.registration_of(surface)
+        assert known is not None
+        assert np.array_equal(known.mesh.vertices, atlas["liver2"].registered)
+    assert base.registration_of(read_surface(files[N])) is None
+
+
+@pytest.mark.parametrize("change", ["axes", "moved", "larger", "label"])
+def test_a_members_file_read_or_changed_otherwise_is_registered_anew(
+    atlas: Atlas, files: list[Path], change: str
+) -> None:
+    base, own, axes = base_of(atlas), read_surface(files[2]), np.eye(4)
+    axes[:3, 3] = 100.0, 50.0, 0.0  # [mm]
+    surface = {
+        "axes": lambda: read_surface(files[2], axes=axes),
+        "moved": lambda: replace(own, vertices=own.vertices + np.array([0.0, 0.0, 0.02])),
+        "larger": lambda: replace(own, vertices=1.2 * own.vertices),
+        "label": lambda: replace(read_surface(files[N]), source_sha256=own.source_sha256),
+    }[change]()
+    assert surface.source_sha256 == own.source_sha256
+    problem, _ = posed_patient(surface, base, "interpolated", QUICK)
+    assert distances_to_mesh(problem).mean() < 3e-3  # a rough registration
+    assert base.registration_of(surface) is None
 
 
 def test_a_copy_of_an_anatomy_without_a_response_has_weight(frame: Frame, tmp_path: Path) -> None:
