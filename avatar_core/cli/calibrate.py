@@ -124,7 +124,7 @@ def calibrate(
     with progress_bar("materials") as progress:
         table = touch_table(vademecum, touched.tip, palpation, progress)
     found = calibrated(table, priors, errors)
-    say_notices(notes)
+    say_notices((*notes, *found.notices))
     say(vademecum.name, table, found)
     for one in output or []:
         _write(one, vademecum.name, table, found)

@@ -11,7 +11,7 @@ import typer
 from avatar_core.cli.numbers import numbers
 from avatar_core.cli.output import Replace, require_output
 from avatar_core.cli.progress import progress_bar
-from avatar_core.cli.vademecum import File, require
+from avatar_core.cli.vademecum import File, require, say_notices
 
 if TYPE_CHECKING:
     from avatar_core.uncertainty.distributions import Distribution
@@ -81,6 +81,7 @@ def uncertainty(
     aim = None if target is None else numbers("--target", target, (3,), wanted)
     with progress_bar("materials") as show:
         bands = force_bands(vademecum, known, points, pressed, tip, aim, draws, seed, show)
+    say_notices(bands.notices)
     say(vademecum.name, draws, known, pressed, bands)
     if output is not None and output.suffix == ".json":
         output.write_text(json.dumps(rows(pressed, bands), indent=1) + "\n")

@@ -41,6 +41,8 @@ class Bands:
         Displacement of the target at 5, 50 and 95 % [m].
     shares : mapping of str to ndarray, shape (n_places, n_depths)
         First-order Sobol index of each uncertain parameter for ln F [-].
+    notices : tuple[str, ...]
+        Supports that are often out of the vademecum's range, one line each.
 
     Examples
     --------
@@ -55,6 +57,7 @@ class Bands:
     force: FloatArray
     moved: FloatArray
     shares: Mapping[str, FloatArray]
+    notices: tuple[str, ...] = ()
 
 
 def force_bands(
@@ -163,6 +166,7 @@ def bands_of(
         np.quantile(table.force(values), levels, axis=0),
         np.quantile(table.moved(values), levels, axis=0),
         _shares(table, known, seed),
+        table.grid.notices(values),
     )
 
 

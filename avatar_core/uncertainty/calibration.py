@@ -61,6 +61,7 @@ _N_WEIGHTINGS = 4  # by the forces that the last one expects
 _FARTHEST = 4.0  # deviations of the tried values from the prior
 _UNKNOWN = 0.1  # error of a force whose place was never certified
 _LEAST_TOUCHES = 3
+_N_DRAWS = 1000  # of the posterior, for notices
 _STEP, _FLAT = 0.05, 1e-6  # step of a standard normal number; least d ln p / dz
 _TAIL = 4.0  # degrees of freedom of a vademecum's error over the stated one
 
@@ -188,6 +189,8 @@ class Calibration:
         Misfit of each touch over its standard deviation.
     probability : float
         Probability that so bad a fit comes by chance.
+    notices : tuple[str, ...]
+        Supports that are often out of the vademecum's range, by draws of the posterior.
 
     Examples
     --------
@@ -205,6 +208,7 @@ class Calibration:
     misfit: FloatArray
     deviations: FloatArray
     probability: float
+    notices: tuple[str, ...] = ()
 
     @property
     def explained(self) -> bool:
@@ -399,13 +403,12 @@ def calibrated(
     # The part of the mesh's error in Young's modulus is no misfit.
     own = replace(errors, mesh=0.0) if "young" in names else errors
 
+    def values_at(z: FloatArray) -> dict[str, FloatArray]:
+        probability, middle = dict(zip(names, ndtr(z.T), strict=True)), np.full(len(z), 0.5)
+        return {name: one.ppf(probability.get(name, middle)) for name, one in known.items()}
+
     def computed(z: FloatArray) -> FloatArray:
-        probability = dict(zip(names, ndtr(z), strict=True))
-        values = {
-            name: np.atleast_1d(one.ppf(np.array(probability.get(name, 0.5))))
-            for name, one in known.items()
-        }
-        return np.asarray(table.at(values)[0])
+        return np.asarray(table.at(values_at(z[None]))[0])
 
     def whitened(z: FloatArray) -> FloatArray:
         misfit = table.measured - computed(z)
@@ -422,14 +425,17 @@ def calibrated(
         deviations = together @ left
         inflated = (_TAIL + deviations**2) / (_TAIL + 1.0)
     derivatives = together @ root @ best.jac[: len(left)]
+    covariance = np.linalg.inv(best.jac.T @ best.jac) + np.diag(_extents(known, names, at, errors))
+    normal = np.random.default_rng(0).standard_normal((_N_DRAWS, len(names)))
     return Calibration(
         known,
         names,
         np.asarray(at),
-        np.linalg.inv(best.jac.T @ best.jac) + np.diag(_extents(known, names, at, errors)),
+        covariance,
         left,
         deviations,
         chance(deviations, _places(table.palpation), derivatives, _TAIL),
+        table.grid.notices(values_at(at + normal @ np.linalg.cholesky(covariance).T)),
     )
 
 

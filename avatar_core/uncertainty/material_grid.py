@@ -20,12 +20,15 @@ from itertools import product
 import numpy as np
 
 from avatar_core.common.arrays import FloatArray
+from avatar_core.common.supports import SUPPORT
 from avatar_core.reduction.coordinates import Coordinate
 from avatar_core.uncertainty.known import uncertain
 from avatar_core.vademecum.model import Vademecum
 
 N_POINTS = 5  # for each coordinate
 _FEWER, _LEAST = {3: 4}, 3  # for each of three, of more
+_MOST_OUTSIDE = 0.01  # fraction of draws outside a support's range that needs no notice
+_SLACK = 1e-9  # relative, for values at the ends of a range
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,26 @@ class MaterialGrid:
             own = lagrange([coordinate.fraction(float(v)) for v in at], self.n_each)
             weights = (weights[:, :, None] * own[:, None, :]).reshape(len(own), -1)
         return weights
+
+    def notices(self, values: Mapping[str, FloatArray]) -> tuple[str, ...]:
+        """Return a notice of each support whose stiffness over "young" is often out of range.
+
+        Each value has the shape (n,). The nearest end of the range stands for draws outside.
+        """
+        found = []
+        for c in self.coordinates:
+            if c.kind != "support":
+                continue
+            at = np.asarray(values[c.name]) / self.softer(values)
+            outside = np.mean((at < c.low * (1.0 - _SLACK)) | (at > c.high * (1.0 + _SLACK)))
+            if outside > _MOST_OUTSIDE:
+                low, high = c.low / self.young, c.high / self.young
+                found.append(
+                    f"{c.name} over young lies outside the {low:.3g} to {high:.3g} /m of the "
+                    f"vademecum in {outside:.0%} of the draws, which take the nearer end; build it "
+                    f"with a wider --support {c.name.removeprefix(SUPPORT)}=LOW:HIGH"
+                )
+        return tuple(found)
 
 
 def chebyshev_points(n: int) -> FloatArray:

@@ -22,6 +22,7 @@ from avatar_core.uncertainty.distributions import (
     Uniform,
 )
 from avatar_core.vademecum.model import Vademecum
+from tests.helpers.soft_organ import organ_on_springs
 
 pytestmark = pytest.mark.long  # it builds an organ
 
@@ -102,3 +103,15 @@ def test_bands_of_no_depth_draw_or_seed_are_refused(
 def test_distributions_are_finite(made: Callable[[], Distribution]) -> None:
     with pytest.raises(CoordinateError, match=r"give .*(finite|LOW < HIGH)"):
         made()
+
+
+def test_supports_out_of_the_built_range_are_said() -> None:
+    """The range counts over Young's modulus: a soft organ on the softest springs stays in it."""
+    organ = organ_on_springs()
+    young, point = organ.material.young_modulus, organ.surface.centers[starts_apart(organ, 1)[0]]
+    uncertain = {"young": Lognormal(young, 2.0), "support.bare_area": Fixed(1e5)}
+    (notice,) = force_bands(organ, uncertain, [point], [3e-3]).notices
+    assert "support.bare_area over young lies outside the" in notice
+    assert "in 50% of the draws" in notice and "wider --support bare_area=LOW:HIGH" in notice
+    inside = {**uncertain, "support.bare_area": Fixed(1e7)}
+    assert force_bands(organ, inside, [point], [3e-3]).notices == ()

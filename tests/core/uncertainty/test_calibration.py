@@ -250,6 +250,17 @@ def test_one_call_goes_from_arrays_to_the_posterior(
     assert fixed.names == ("young", "contrast")
 
 
+def test_a_support_that_may_lie_out_of_the_built_range_is_said() -> None:
+    organ = organ_on_springs()
+    tips, young = path_over(organ, 4), organ.material.young_modulus
+    softest = organ.at({"young": young, "support.bare_area": 1e5})
+    known = {"young": Lognormal(young, 1.5)}
+    (notice,) = calibrate(organ, tips, felt(softest, tips), SPHERE, known).notices
+    assert "support.bare_area over young lies outside" in notice
+    sure = {"young": Fixed(young), "support.bare_area": Fixed(1e5)}
+    assert calibrate(organ, tips, felt(softest, tips), SPHERE, sure).notices == ()
+
+
 # --- the command -------------------------------------------------------------------------------
 
 
