@@ -1,4 +1,4 @@
-"""Doubts about an organ before it is built: its size, bodies on bridges, lesions outside."""
+"""Doubts about an organ before it is built: size, holes, bodies on bridges, lesions outside."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from avatar_core.geometry.label_masks import in_ml
 from avatar_core.geometry.surface import SurfaceMesh, box_points
 
 LIVER_VOLUMES = (700e-6, 3500e-6)  # [m^3]
+# Least part of the surface of a hole that is no defect of a segmentation, 30 mm wide on a liver.
+_HOLE = 0.005
 _DEPTH = 5e-3  # eroded depth, which cuts bridges of up to twice that [m]
 _SPACING = 3e-3  # spacing of the grid of the erosion [m]
 # Least part of the rest that counts as a body. At most 0.1 % splits off from any of 64 livers.
@@ -38,7 +40,8 @@ def doubts_of(
         If less than half of a lesion lies in the organ.
     """
     placed = [notice for lesion in inside for notice in _placement(organ, lesion)]
-    return (*placed, *(() if has_groups else size_notice(organ)), *_bridge_notice(organ))
+    size = () if has_groups else size_notice(organ)
+    return (*placed, *size, *_hole_notices(organ), *_bridge_notice(organ))
 
 
 def size_notice(organ: SurfaceMesh) -> tuple[str, ...]:
@@ -71,6 +74,16 @@ def _placement(organ: SurfaceMesh, lesion: SurfaceMesh) -> tuple[str, ...]:
         return ()  # reported by its reader
     out = "" if share > _ALL else f", reaching {reach:.0f} mm out"
     return (f"lesion {lesion.name}: {volume}, inside: {share:.0%}{out}",)
+
+
+def _hole_notices(organ: SurfaceMesh) -> tuple[str, ...]:
+    """Return a notice of each hole that is more than a crack."""
+    return tuple(
+        f"a hole of {part:.1%} of the surface at ({1e3 * x:.0f}, {1e3 * y:.0f}, {1e3 * z:.0f}) mm "
+        "was closed flat: part of the organ may be missing; segment the whole organ"
+        for part, x, y, z in organ.skin.holes
+        if part > _HOLE
+    )
 
 
 def _bridge_notice(organ: SurfaceMesh) -> tuple[str, ...]:

@@ -38,10 +38,13 @@ class Skin:
         The surface and the cones over its holes; the winding number on it decides what is inside.
     boundary : Soup
         Triangles of ``covered`` with inside on one side and outside on the other.
+    holes : ndarray, shape (n_holes, 4)
+        Area of each cone over the area of ``covered``, and middle of its rim [m].
     """
 
     covered: Soup
     boundary: Soup
+    holes: FloatArray
 
     def contains(self, points: FloatArray) -> NDArray[np.bool_]:
         """Return whether points lie inside, |w| > 1/2 whichever way the faces turn, shape (k,)."""
@@ -66,14 +69,15 @@ def skin_of(vertices: FloatArray, faces: NDArray[Any], name: str = "surface") ->
     surface = (np.array(vertices), np.array(faces, dtype=np.int64))
     cones = _covers(*surface)
     covered = (np.vstack([surface[0], cones[0]]), np.vstack([surface[1], cones[1]]))
-    _require_small(covered, len(surface[0]), len(surface[1]), name)
+    holes = _holes(covered, len(surface[0]), len(surface[1]))
+    _require_small(holes, name)
     boundary = _boundary(covered)
     if len(boundary[1]) == 0:
         raise SurfaceError(
             f"{name}: the surface encloses no volume; "
             "give the whole closed surface with consistently oriented faces"
         )
-    return Skin(covered, boundary)
+    return Skin(covered, boundary, holes)
 
 
 def weld(vertices: FloatArray, tolerance: float = 1e-7) -> IntArray:
@@ -133,11 +137,17 @@ def _covers(vertices: FloatArray, faces: IntArray) -> Soup:
     return apices, np.column_stack([corners[:, ::-1], len(vertices) + label[chosen]])
 
 
-def _require_small(covered: Soup, n_vertices: int, n_faces: int, name: str) -> None:
-    """Raise SurfaceError if a cone, after that many vertices and faces, covers too much."""
-    areas = igl.doublearea(*covered) / 2
-    cones = np.bincount(covered[1][n_faces:, 2] - n_vertices, areas[n_faces:], minlength=1)
-    fraction = cones.max() / areas.sum()
+def _holes(covered: Soup, n_vertices: int, n_faces: int) -> FloatArray:
+    """Return the part of the area and the apex of each cone, after that many vertices and faces."""
+    areas, apices = igl.doublearea(*covered) / 2, covered[0][n_vertices:]
+    cone = covered[1][n_faces:, 2] - n_vertices
+    own = np.bincount(cone, areas[n_faces:], minlength=len(apices)) / areas.sum()
+    return np.column_stack([own, apices])[own > 0.0]
+
+
+def _require_small(holes: FloatArray, name: str) -> None:
+    """Raise SurfaceError if a cone covers too much."""
+    fraction = holes[:, 0].max(initial=0.0)
     if fraction > LARGEST_HOLE:
         raise SurfaceError(
             f"{name}: the surface is open (a hole takes {fraction:.0%} of it); "

@@ -179,8 +179,8 @@ def read_surface(
     Raises
     ------
     SurfaceError
-        If the file is missing or unreadable, has no triangles, points that are not finite, an open
-        surface or more than one organ, or if the size is implausible.
+        If the file is missing or unreadable, has no triangles, points that are not finite, a large
+        hole or more than one organ, or if the size is implausible.
 
     Examples
     --------

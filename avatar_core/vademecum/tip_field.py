@@ -94,7 +94,7 @@ def make_tip_field(
         If the outline encloses nothing or has a large hole.
     """
     own = (mesh.vertices, mesh.boundary_faces)
-    skin = Skin(own, own) if outline is None else outline.skin
+    skin = Skin(own, own, np.zeros((0, 4))) if outline is None else outline.skin
     fade = FADING * patch_radius
     near = _near(skin.boundary, mesh, regions, fade)
     corners = mesh.vertices[mesh.boundary_faces[regions.accessible]].reshape(-1, 3)

@@ -1,6 +1,8 @@
-"""Doubts about an organ: its size, a second body on a bridge, a lesion out of place."""
+"""Doubts about an organ: its size, holes, a second body on a bridge, a lesion out of place."""
 
 from __future__ import annotations
+
+import re
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from avatar_core.errors import SurfaceError
 from avatar_core.geometry.doubts import doubts_of
 from avatar_core.geometry.level_set import DistanceGrid, isosurface
 from avatar_core.geometry.surface import SurfaceMesh
-from tests.helpers.known_surfaces import ball
+from tests.helpers.known_surfaces import ball, with_hole
 
 LIVER = ball(0.065, level=3)  # 1,150 ml
 
@@ -55,3 +57,14 @@ def test_a_body_on_a_thin_bridge_is_said(width: float, is_said: bool) -> None:
     surface: SurfaceMesh = isosurface(DistanceGrid(tuple(origin), spacing, values))
     found = [notice for notice in doubts_of(surface) if "hangs on the rest" in notice]
     assert len(found) == is_said
+
+
+def test_a_hole_that_was_closed_is_said_and_a_missing_triangle_is_not() -> None:
+    pole = np.array([0.0, 0.0, 0.065])
+    (notice,) = doubts_of(with_hole(LIVER, pole, 0.04))
+    found = re.fullmatch(r"a hole of (.*)% of the surface at \((.*)\) mm was closed flat.*", notice)
+    assert found and 3.0 < float(found[1]) < 4.5
+    x, y, z = map(float, found[2].split(","))
+    assert abs(x) < 4.0 and abs(y) < 4.0 and 57.0 < z < 65.0
+    small = SurfaceMesh(LIVER.vertices, LIVER.faces[1:])
+    assert not small.is_watertight and doubts_of(small) == ()
