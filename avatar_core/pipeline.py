@@ -90,7 +90,7 @@ class OrganOptions:
         each. The first ``COMBINED_SITES`` are certified together with other effects too, by nine
         more each.
     n_certified : int
-        Number of unseen load positions of the certificate.
+        Number of unseen load positions of the certificate, at least 1.
     n_contact_sites : int
         Number of places, 0 or at least 3, at which the certificate resolves contacts of real tips.
     seed : int
@@ -140,9 +140,7 @@ class OrganOptions:
         if len(set(names)) < len(names):
             raise CoordinateError(f"a coordinate is given twice: {', '.join(names)}")
         if any(c.kind == "support" for c in self.coordinates):
-            raise CoordinateError(
-                "the stiffness of a support is chosen with --support NAME=LOW:HIGH"
-            )
+            raise CoordinateError("a support's stiffness is chosen with --support NAME=LOW:HIGH")
         if any(c.kind == RESECTION for c in self.coordinates):
             raise CoordinateError("a resection needs its surface; give it with --resection FILE")
         if self.resection and (self.large or self.n_contact_sites or self.with_mesh_error):
@@ -165,6 +163,8 @@ class OrganOptions:
                 )
         if self.seed < 0:
             raise AvatarError(f"the seed is {self.seed}; give 0 or more")
+        if self.n_certified < 1:
+            raise AvatarError(f"{self.n_certified} loads certify nothing; give 1 or more")
         low, high = LIMITS["contrast"]
         if not low <= self.contrast <= high:
             raise CoordinateError(f"the contrast is {self.contrast:g}; give {low:g} to {high:g}")

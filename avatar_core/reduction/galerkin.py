@@ -27,6 +27,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from avatar_core.common.arrays import FloatArray
+from avatar_core.errors import ConvergenceError
 from avatar_core.fem.elasticity import Elasticity
 from avatar_core.fem.norms import l2_norm, require_orthonormal
 from avatar_core.fem.patch_loads import LoadSurface, scaled_gram, triples
@@ -92,8 +93,7 @@ def solve_galerkin(
 ) -> SeparatedField:
     """Solve K u(s) = f(s) for all loads in the space of a given basis V.
 
-    X = V A with X^T K X = I, and Y(s) = X^T f(s). No field of the space has a smaller error in the
-    energy norm.
+    X = V A with X^T K X = I, Y(s) = X^T f(s). No field of the space is nearer in the energy norm.
 
     Parameters
     ----------
@@ -110,6 +110,11 @@ def solve_galerkin(
         X, shape (n_dofs, r), and Y, shape (n_loads, r), r the dimension of the space. Y Y^T is the
         compliance between the loads.
 
+    Raises
+    ------
+    ConvergenceError
+        If a column of the basis is zero or not finite.
+
     Examples
     --------
     >>> U = np.linalg.solve(K.toarray(), F)
@@ -119,6 +124,8 @@ def solve_galerkin(
     """
     work = basis.T @ operator_of(operator).apply(basis)
     size = np.sqrt(np.diagonal(work))
+    if not ((size > 0.0) & (size < np.inf)).all():
+        raise ConvergenceError("a column of the basis is zero or not finite; leave it out")
     value, vector = np.linalg.eigh(work / np.outer(size, size))
     new = value > _DEPENDENT[False]
     space = (basis / size) @ (vector[:, new] / np.sqrt(value[new]))

@@ -24,9 +24,9 @@ def pod(
     snapshots : array_like, shape (n_dofs, n_loads)
         U, one solution a column.
     rank : int
-        Number of modes at most.
+        Number of modes at most, at least 0.
     mass : array_like, shape (n_dofs,), optional
-        M, lumped, of the norm in space. The default is 1 everywhere.
+        M, lumped, of the norm in space, positive. The default is 1 everywhere.
     relative : bool
         Whether each snapshot counts relative to its own norm.
 
@@ -38,7 +38,8 @@ def pod(
     Raises
     ------
     ConvergenceError
-        If all snapshots are zero, or a number is not finite.
+        If all snapshots are zero, a number is not finite, the rank is negative or a mass is not
+        positive.
 
     Examples
     --------
@@ -52,7 +53,14 @@ def pod(
         raise ConvergenceError(
             f"snapshots of shape {u.shape} have no modes; give finite columns that are not all zero"
         )
-    root = np.sqrt(np.ones(len(u)) if mass is None else np.asarray(mass, float))[:, None]
+    if rank < 0:
+        raise ConvergenceError(f"the rank is {rank}; give 0 or more modes")
+    lumped = np.ones(len(u)) if mass is None else np.asarray(mass, float)
+    if lumped.shape != (len(u),) or not (np.isfinite(lumped) & (lumped > 0.0)).all():
+        raise ConvergenceError(
+            f"the mass of shape {lumped.shape} is no norm; give {len(u)} positive numbers"
+        )
+    root = np.sqrt(lumped)[:, None]
     scaled = root * u
     size = np.linalg.norm(scaled, axis=0)
     counted = scaled / np.where(size > 0.0, size, 1.0) if relative else scaled

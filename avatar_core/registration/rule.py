@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
@@ -61,7 +62,7 @@ class RegistrationRule:
     Raises
     ------
     RegistrationError
-        For a number out of its range.
+        For a number out of its range, or an unknown kind.
 
     Examples
     --------
@@ -92,6 +93,10 @@ class RegistrationRule:
                 raise RegistrationError(f"{name} is {value:g}; give {low:g} to {high:g}{unit}")
         if not 0.0 <= self.turn <= np.pi:
             raise RegistrationError(f"turn is {np.degrees(self.turn):g} degrees; give 0 to 180")
+        if self.kind not in (None, *get_args(Kind)):
+            raise RegistrationError(
+                f"unknown kind {self.kind!r}; choose one of {', '.join(get_args(Kind))}, or None"
+            )
 
     def scales(self, kind: Kind, young_modulus: float) -> Scales:
         """Return prior scales of loads, length, noise and mismatch."""

@@ -33,7 +33,7 @@ These d also decide whether the model can have made the forces at all; see
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,7 +44,7 @@ from scipy.special import ndtr
 from avatar_core.common.arrays import FloatArray
 from avatar_core.contact.layout import Shape, lay_out
 from avatar_core.contact.model import ContactModel, Status, estimate_error, step
-from avatar_core.errors import ContactError
+from avatar_core.errors import AvatarError, ContactError
 from avatar_core.geometry.tip import Tip
 from avatar_core.uncertainty.distributions import Distribution, Fixed, Lognormal
 from avatar_core.uncertainty.fit_check import chance
@@ -83,6 +83,11 @@ class TouchErrors:
     extent : float
         Error of the mesh for the extent of a tumour or support, relative to contrast or stiffness.
 
+    Raises
+    ------
+    AvatarError
+        For a negative number or NaN, or if both errors of the sensor are 0.
+
     Examples
     --------
     >>> av.uncertainty.TouchErrors(sensor=0.05).depth  # [m]
@@ -94,6 +99,14 @@ class TouchErrors:
     depth: float = 0.3e-3
     mesh: float = 0.045
     extent: float = 0.2
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if not 0.0 <= value < np.inf:
+                raise AvatarError(f"the error {one.name} is {value:g}; give 0 or a positive number")
+        if self.sensor == self.least == 0.0:
+            raise AvatarError("the errors sensor and least are both 0; give one, e.g. sensor=0.02")
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,7 +290,7 @@ def calibrate(
     StorageError
         If the forces hold no touch.
     ContactError
-        If fewer than three touches meet the organ.
+        If fewer than three touches meet the organ, or there is not one force for each place.
     CoordinateError
         If the vademecum has no such parameter.
 
@@ -295,9 +308,14 @@ def calibrate(
     >>> low < 6e3 < high
     True
     """
-    size = np.asarray(forces, float)
+    size, path = np.asarray(forces, float), np.asarray(tips, float)
     size = np.linalg.norm(size, axis=1) if size.ndim == 2 else size
-    palpation = palpation_of(np.asarray(tips, float), size)
+    if path.ndim != 2 or path.shape[1] != 3 or size.shape != path.shape[:1]:
+        raise ContactError(
+            f"tips of shape {path.shape} and forces of shape {np.shape(forces)} do not match; give "
+            "tips (n, 3), and forces (n,) or (n, 3)"
+        )
+    palpation = palpation_of(path, size)
     table = touch_table(vademecum, tip or Tip(), palpation)
     return calibrated(table, priors_of(vademecum, known), errors)
 

@@ -54,3 +54,8 @@ def test_a_value_inside_its_range_is_not_spoken_of() -> None:
 def test_a_seed_below_zero_is_refused() -> None:
     with pytest.raises(AvatarError, match="the seed is -1; give 0 or more"):
         OrganOptions(seed=-1)
+
+
+def test_a_certificate_of_no_load_is_refused() -> None:
+    with pytest.raises(AvatarError, match="0 loads certify nothing; give 1 or more"):
+        OrganOptions(n_certified=0)

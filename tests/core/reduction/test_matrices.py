@@ -131,3 +131,30 @@ def test_regions_of_an_array_count_relative_to_its_columns(exact: np.ndarray) ->
 def test_a_matrix_of_one_triangle_is_refused(stiffness: sp.csr_matrix) -> None:
     with pytest.raises(ConvergenceError, match="give both triangles"):
         av.mor.LoadProblem(sp.triu(stiffness), np.ones((stiffness.shape[0], 1)))
+
+
+@pytest.mark.parametrize(
+    ("rank", "mass", "reason"),
+    [
+        (-1, None, "the rank is -1; give 0 or more"),
+        (2, np.zeros(120), "give 120 positive numbers"),
+        (2, -MASS, "give 120 positive numbers"),
+        (2, MASS[:-1], "give 120 positive numbers"),
+        (2, np.full(120, np.nan), "give 120 positive numbers"),
+    ],
+)
+def test_pod_of_no_rank_or_norm_is_refused(
+    exact: np.ndarray, rank: int, mass: np.ndarray | None, reason: str
+) -> None:
+    with pytest.raises(ConvergenceError, match=reason):
+        av.mor.pod(exact, rank, mass)
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
+def test_a_basis_with_a_column_that_is_no_field_is_refused(
+    stiffness: sp.csr_matrix, loads: np.ndarray, exact: np.ndarray, value: float
+) -> None:
+    basis = exact[:, ::3].copy()
+    basis[:, 4] = value
+    with pytest.raises(ConvergenceError, match="zero or not finite; leave it out"):
+        av.mor.solve_galerkin(stiffness, loads, basis)

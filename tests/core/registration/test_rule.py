@@ -33,3 +33,10 @@ def test_a_number_of_the_rule_out_of_its_range_is_refused(
 ) -> None:
     with pytest.raises(RegistrationError, match=re.escape(reason)):
         RegistrationRule(**given)
+
+
+def test_an_unknown_kind_of_loads_is_refused() -> None:
+    kinds = "choose one of smooth, few, pressure, or None"
+    with pytest.raises(RegistrationError, match=f"unknown kind 'pressur'; {kinds}"):
+        RegistrationRule(kind="pressur")  # type: ignore[arg-type]
+    assert RegistrationRule(kind="pressure").kind == "pressure"

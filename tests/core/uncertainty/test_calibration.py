@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar_core.errors import ContactError, CoordinateError, StorageError
+from avatar_core.errors import AvatarError, ContactError, CoordinateError, StorageError
 from avatar_core.scene.recording import save_recording
 from avatar_core.uncertainty import material_grid
 from avatar_core.uncertainty.calibration import (
@@ -259,6 +259,29 @@ def test_a_support_that_may_lie_out_of_the_built_range_is_said() -> None:
     assert "support.bare_area over young lies outside" in notice
     sure = {"young": Fixed(young), "support.bare_area": Fixed(1e5)}
     assert calibrate(organ, tips, felt(softest, tips), SPHERE, sure).notices == ()
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ({"sensor": float("nan")}, "error sensor is nan; give 0 or a positive"),
+        ({"least": float("inf")}, "error least is inf"),
+        ({"depth": -1e-3}, "error depth is -0.001"),
+        ({"sensor": 0.0, "least": 0.0}, "sensor and least are both 0; give one"),
+    ],
+)
+def test_errors_that_no_force_has_are_refused(given: dict[str, float], reason: str) -> None:
+    with pytest.raises(AvatarError, match=reason):
+        TouchErrors(**given)
+
+
+def test_tips_and_forces_that_do_not_match_are_refused(
+    organ: Vademecum, tips: np.ndarray, forces: np.ndarray
+) -> None:
+    size = np.linalg.norm(forces, axis=1)
+    for path, measured in ((tips, forces[1:]), (tips[1:], size), (tips[:, :2], size)):
+        with pytest.raises(ContactError, match=r"do not match; give tips \(n, 3\)"):
+            calibrate(organ, path, measured, SPHERE)
 
 
 # --- the command -------------------------------------------------------------------------------
