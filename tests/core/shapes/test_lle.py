@@ -269,7 +269,8 @@ def sound(found: Barycenter, base: np.ndarray, x: np.ndarray, r: float) -> None:
     assert np.isfinite(w).all()
     assert abs(w.sum() - 1.0) <= 2.0 * k * EPS * found.absolute_sum
     assert w @ w <= (1.0 + 1.0 / (r * k)) * (1.0 + 1e-3)  # 1e-3: rounding of C at r = 1e-12
-    rounding = 8.0 * k * EPS * np.abs(base).max() * np.sqrt(base.shape[1]) * found.absolute_sum
+    largest = max(np.abs(base).max(), np.abs(x).max())  # x (1 - sum w) is the rounding of the sum
+    rounding = 8.0 * k * EPS * largest * np.sqrt(base.shape[1]) * found.absolute_sum
     left = np.linalg.norm(x - w @ base[found.neighbors])
     assert found.residual == pytest.approx(left, abs=rounding)
     assert found.hull_distance <= found.distances[0] + rounding
