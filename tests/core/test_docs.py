@@ -15,6 +15,7 @@ import typer
 
 import avatar_core as av
 from avatar_core.cli.main import app
+from tests.core.test_prose import INVERTED
 from tests.helpers.paths import ROOT
 
 README, DOCS = ROOT / "README.md", ROOT / "msg_docs"
@@ -121,6 +122,11 @@ def sentences(page: Path) -> list[str]:
 @pytest.mark.parametrize("page", [README, *PAGES], ids=lambda page: page.name)
 def test_sentences_are_short(page: Path) -> None:
     assert not [sentence for sentence in sentences(page) if len(sentence.split()) > LONGEST]
+
+
+@pytest.mark.parametrize("page", [README, *PAGES], ids=lambda page: page.name)
+def test_sentences_begin_with_their_subject(page: Path) -> None:
+    assert not [sentence for sentence in sentences(page) if INVERTED.match(sentence)]
 
 
 def test_the_readme_can_be_read_in_one_go() -> None:
